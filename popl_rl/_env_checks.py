@@ -1,0 +1,269 @@
+"""The single checks behind :func:`popl_rl.testing.check_env`; each raises with a cure.
+
+``name`` is what messages call the environment.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torchrl import logger
+from torchrl.envs import GymWrapper
+from torchrl.envs.utils import check_env_specs
+
+from popl_rl.keys import INFO, OBSERVATION, REWARD
+from popl_rl.planning import Table
+
+Env: TypeAlias = gymnasium.Env[Any, Any]
+
+
+class Step(NamedTuple):
+    """What an environment said; ``action`` is None for a reset."""
+
+    action: Any
+    observation: NDArray[np.float32]
+    reward: float
+    terminated: bool
+    info: dict[str, float]
+
+
+def call(name: str, doing: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    try:
+        return function(*args, **kwargs)
+    except Exception as error:
+        message = f"env {name!r}: {doing} failed with {type(error).__name__}: {error}"
+        raise ValueError(message) from error
+
+
+def check_spaces(name: str, env: Env) -> None:
+    seen, acts = env.observation_space, env.action_space
+    if not isinstance(seen, gymnasium.spaces.Box) or len(seen.shape) != 1:
+        raise TypeError(
+            f"env {name!r}: observation_space must be a Box with one dimension, got {seen}; wrap it "
+            "in gymnasium.wrappers.FlattenObservation."
+        )
+    if seen.dtype != np.float32:
+        raise TypeError(
+            f"env {name!r}: observation_space must be float32, got {seen.dtype}; wrap it in "
+            "gymnasium.wrappers.DtypeObservation(env, np.float32)."
+        )
+    if isinstance(acts, gymnasium.spaces.Discrete):
+        if acts.start != 0:
+            raise ValueError(
+                f"env {name!r}: actions must start at 0, got {acts}; shift them in the environment."
+            )
+    elif not isinstance(acts, gymnasium.spaces.Box) or len(acts.shape) != 1:
+        raise TypeError(
+            f"env {name!r}: action_space must be Discrete or a Box with one dimension, got {acts}; "
+            "wrap it in gymnasium.wrappers.TransformAction."
+        )
+    elif not acts.is_bounded():
+        raise ValueError(
+            f"env {name!r}: a Box of actions must be bounded, got {acts}; give it low and high."
+        )
+
+
+def random_steps(name: str, env: Env, num_steps: int, seed: int) -> list[Step]:
+    """Take random steps, checking each answer; an episode's first entry is its reset."""
+    env.action_space.seed(seed)
+    steps: list[Step] = []
+    over = True
+    first_reset = True
+    held: tuple[NDArray[Any], NDArray[Any]] | None = None
+    for _ in range(num_steps):
+        if over:
+            # Later episodes go on from the first seed, which a careless reset would also get wrong.
+            answer = call(name, "reset", env.reset, seed=seed if first_reset else None)
+            first_reset = False
+            if not isinstance(answer, tuple) or len(answer) != 2:
+                raise TypeError(
+                    f"env {name!r}: reset must return (observation, info), got {_described(answer)}."
+                )
+            action, (observation, info), reward, terminated, over = None, answer, 0.0, False, False
+        else:
+            action = env.action_space.sample()
+            answer = call(name, "step", env.step, action)
+            if not isinstance(answer, tuple) or len(answer) != 5:
+                raise TypeError(
+                    f"env {name!r}: step must return (observation, reward, terminated, truncated, "
+                    f"info), got {_described(answer)}."
+                )
+            observation, reward, terminated, truncated, info = answer
+            _check_outcome(name, reward, terminated, truncated)
+            over = bool(terminated or truncated)
+        _check_observation(name, env, observation)
+        _check_info(name, info, steps[0].info if steps else None)
+        if held is not None and not np.array_equal(held[0], held[1]):
+            raise ValueError(
+                f"env {name!r}: an observation changed after it was returned; return a copy, as in "
+                "observation.copy()."
+            )
+        held = observation, observation.copy()
+        # After the copy, since an environment may also hand out one info again and again.
+        steps.append(Step(action, held[1], float(reward), bool(terminated), dict(info)))
+    return steps
+
+
+def _described(answer: Any) -> str:
+    return f"{len(answer)} values" if isinstance(answer, tuple) else f"a {type(answer).__name__}"
+
+
+def _check_observation(name: str, env: Env, observation: Any) -> None:
+    space = env.observation_space
+    if not isinstance(observation, np.ndarray) or observation.dtype != np.float32:
+        kind = getattr(observation, "dtype", type(observation).__name__)
+        raise TypeError(
+            f"env {name!r}: observations must be float32 arrays, got {kind}; use "
+            "observation.astype(np.float32)."
+        )
+    if not np.isfinite(observation).all():
+        raise ValueError(f"env {name!r}: observations must be finite, got {observation}.")
+    if not space.contains(observation):
+        raise ValueError(
+            f"env {name!r}: observations must lie in {space}, got shape {observation.shape} with "
+            f"values from {observation.min():g} to {observation.max():g}; correct the space."
+        )
+
+
+def _check_outcome(name: str, reward: Any, terminated: Any, truncated: Any) -> None:
+    if not isinstance(reward, (int, float, np.integer, np.floating)):
+        raise TypeError(
+            f"env {name!r}: the reward must be a number, got a {type(reward).__name__}; use float()."
+        )
+    if not np.isfinite(reward):
+        raise ValueError(f"env {name!r}: the reward must be finite, got {reward}.")
+    for label, value in (("terminated", terminated), ("truncated", truncated)):
+        if not isinstance(value, (bool, np.bool_)):
+            raise TypeError(
+                f"env {name!r}: {label} must be a bool, got a {type(value).__name__}; use bool()."
+            )
+
+
+def _check_info(name: str, info: Any, first: dict[str, float] | None) -> None:
+    if not isinstance(info, dict):
+        raise TypeError(f"env {name!r}: info must be a dict, got a {type(info).__name__}.")
+    if first is not None and info.keys() != first.keys():
+        raise ValueError(
+            f"env {name!r}: info must have the same keys at every reset and step, got "
+            f"{sorted(first)} and then {sorted(info)}; fill what is missing with a neutral number."
+        )
+    for key, value in info.items():
+        if not isinstance(value, (bool, int, float, np.number, np.bool_)):
+            raise TypeError(
+                f"env {name!r}: info[{key!r}] must be a number, got a {type(value).__name__}; use "
+                "float() or int(), or leave it out."
+            )
+        if not np.isfinite(value):
+            raise ValueError(f"env {name!r}: info[{key!r}] must be finite, got {value}.")
+
+
+def check_repeats(name: str, first: list[Step], second: list[Step]) -> None:
+    for one, other in zip(first, second, strict=True):
+        if not (
+            np.array_equal(one.observation, other.observation)
+            and (one.reward, one.terminated, one.info)
+            == (other.reward, other.terminated, other.info)
+        ):
+            raise ValueError(
+                f"env {name!r}: the same seed and actions must give the same episodes, but they "
+                "differ; call super().reset(seed=seed) and draw from self.np_random only."
+            )
+
+
+def check_table(name: str, table: Any, env: Env, steps: list[Step]) -> None:
+    """Check that a transition table says what stepping does."""
+    if not isinstance(table, Table):
+        raise TypeError(
+            f"env {name!r}: transition_table() must return a popl_rl.planning.Table, got a "
+            f"{type(table).__name__}."
+        )
+    count = getattr(env.action_space, "n", None)
+    if count != table.next_state.shape[1]:
+        raise ValueError(
+            f"env {name!r}: transition_table() lists {table.next_state.shape[1]} actions, but "
+            f"action_space is {env.action_space}; list every action of a Discrete space."
+        )
+    listed = set(table.steps[INFO].keys())
+    given = steps[0].info.keys()
+    if not {"state", "next_state"} <= given or not given <= listed:
+        raise ValueError(
+            f"env {name!r}: with a transition table, info must hold 'state' and 'next_state', and "
+            f"the table all of info's keys; info has {sorted(given)}, the table {sorted(listed)}."
+        )
+    current = -1
+    for step in steps:
+        if step.action is None:
+            current = int(step.info["state"])
+            if not 0 <= current < len(table.start) or table.start[current] <= 0:
+                _disagree(name, f"start gives no probability to the first state {current}")
+            continue
+        row = table.steps[current, int(step.action)]
+        where = f"at state {current} and action {int(step.action)}"
+        after = int(table.next_state[current, int(step.action)])
+        if step.info["state"] != current:
+            raise ValueError(
+                f"env {name!r}: info['state'] must be the state before the step, {current}, got "
+                f"{step.info['state']}."
+            )
+        if step.info["next_state"] != after:
+            _disagree(name, f"next_state is {after} {where}, stepped to {step.info['next_state']}")
+        if step.terminated != bool(table.terminal[current, int(step.action)]):
+            _disagree(name, f"terminal is {not step.terminated} {where}, it was {step.terminated}")
+        if not np.isclose(step.reward, float(row[REWARD]), atol=1e-5):
+            _disagree(name, f"reward is {float(row[REWARD]):g} {where}, got {step.reward:g}")
+        if not np.allclose(step.observation, table.steps[OBSERVATION][after, 0], atol=1e-5):
+            _disagree(name, f"the observation of state {after} is not the one seen")
+        for key, value in step.info.items():
+            if not np.isclose(float(value), float(row[INFO, key]), atol=1e-5):
+                _disagree(name, f"info {key!r} is {float(row[INFO, key]):g} {where}, got {value}")
+        current = after
+
+
+def _disagree(name: str, what: str) -> None:
+    raise ValueError(
+        f"env {name!r}: transition_table() must agree with stepping, but {what}; build both from "
+        "one function."
+    )
+
+
+def check_behaviours(name: str, found: Any) -> None:
+    """Check that behaviours are functions or tables of probabilities."""
+    if not isinstance(found, dict) or not found:
+        raise TypeError(
+            f"env {name!r}: behaviours() must return a dict of name to probabilities, got "
+            f"{found if found == {} else type(found).__name__}."
+        )
+    for label, policy in found.items():
+        if not isinstance(policy, Tensor) or not policy.is_floating_point() or policy.ndim != 2:
+            # Other environments may hand out functions; only tables can be checked here.
+            if callable(policy):
+                continue
+            raise TypeError(
+                f"env {name!r}: behaviour {label!r} must be float [states, actions] or a function, "
+                f"got {type(policy).__name__}."
+            )
+        if not bool((policy >= 0).all()) or not torch.allclose(
+            policy.sum(1), policy.new_ones(len(policy)), atol=1e-4
+        ):
+            raise ValueError(
+                f"env {name!r}: each row of behaviour {label!r} must be probabilities that sum to "
+                "1; use softmax(-1)."
+            )
+
+
+def check_torchrl(name: str, env: Env) -> None:
+    level = logger.level
+    logger.setLevel("ERROR")
+    try:
+        check_env_specs(GymWrapper(env, categorical_action_encoding=True))
+    except Exception as error:
+        raise ValueError(
+            f"env {name!r}: TorchRL's check_env_specs failed with {type(error).__name__}: "
+            f"{error} Make the spaces describe what reset and step return."
+        ) from error
+    finally:
+        logger.setLevel(level)

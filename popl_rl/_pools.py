@@ -1,0 +1,376 @@
+"""The engine behind `popl_rl.lexicase`: pools of members, narrowed in many selections at once.
+
+`PassPools` and `ScorePools` hold the pools and filter them by a case; `Round` decides which case
+comes next in each selection and when a selection is over. Nothing here checks its arguments.
+"""
+
+import torch
+from torch import Tensor
+
+# Work is measured in nanoseconds as seen on one CPU core. The figures decide only when a round
+# stops drawing cases blindly, so they touch the speed, never the result.
+BLOCK_NS = 200_000  # the fixed cost of one block of draws
+SETTLE_NS = 150_000  # the fixed cost of settling one selection
+
+
+class Epsilon:
+    """Tolerance per case: given, or the median absolute deviation, worked out where it is needed.
+
+    Args:
+        values: The tolerances, ``[case]``; NaN where the deviation is to be worked out.
+        scores: Scores of all members, ``[member, case]``, for the deviation.
+    """
+
+    def __init__(self, values: Tensor, scores: Tensor) -> None:
+        self.values = values
+        self.scores = scores
+        self.missing = int(values.isnan().sum())
+
+    def at(self, cases: Tensor) -> Tensor:
+        """Tolerances of the cases at these indices, in their shape."""
+        if self.missing:
+            wanted = cases.unique()
+            wanted = wanted[self.values[wanted].isnan()]
+            for part in wanted.split(max(1, 2**22 // len(self.scores))):
+                column = self.scores.gather(1, part.expand(len(self.scores), -1))
+                self.values[part] = median_absolute_deviation(column)
+            self.missing -= len(wanted)
+        return self.values[cases]
+
+
+def median_absolute_deviation(values: Tensor) -> Tensor:
+    """Median distance from the median of each column: ``[member, case] -> [case]``."""
+    values = values.T.contiguous()
+    return _median((values - _median(values)[:, None]).abs_())
+
+
+def _median(values: Tensor) -> Tensor:
+    """Median of each row, the mean of the two middle values if there are two."""
+    half = values.topk(values.shape[1] // 2 + 1, largest=False, sorted=False).values
+    return half.amax(1) if values.shape[1] % 2 else half.topk(2).values.mean(1)
+
+
+class PassPools:
+    """Pools of members that pass or fail each case: one bit per member and selection.
+
+    A case then filters eight members with one byte operation.
+
+    Args:
+        passes: Who passes what, ``[member, case]``, bool.
+    """
+
+    epsilon = None
+
+    def __init__(self, passes: Tensor) -> None:
+        self.scores = passes.view(torch.uint8)
+        self.packed = _pack(self.scores)  # [member / 8, case]
+        self.cases = (self.packed.amax(0) > 0).logical_and_(self.packed.amin(0) < 255).nonzero()[:, 0]
+        # A case halves a pool at best, so that many it takes, and a few more for the unlucky.
+        self.block = (len(passes) - 1).bit_length() + 6
+        self.chunk = max(1, 2**24 // (self.block * len(self.packed)))
+        self.ones = torch.tensor([byte.bit_count() for byte in range(256)], device=passes.device)
+
+    def open(self, num_selections: int) -> None:
+        """Start this many selections, each with every member in its pool."""
+        bits = torch.full_like(self.packed[:, :1], 255)
+        bits[-1] >>= -len(self.scores) % 8
+        self.bits = bits.repeat(1, num_selections)  # [member / 8, selection]
+
+    def narrow(self, cases: Tensor, closed: Tensor | None) -> tuple[Tensor, float]:
+        """Filter each pool by its cases in turn.
+
+        Args:
+            cases: Which case comes next, ``[step, selection]``.
+            closed: Where the case does not count any more, ``[step, selection]``; None if nowhere.
+
+        Returns:
+            Where members were removed, ``[step, selection]``, and the work it took.
+        """
+        steps, selections = cases.shape
+        passed = self.packed.gather(1, cases.reshape(-1).expand(len(self.packed), -1))
+        passed = passed.view(-1, steps, selections)
+        history = [self.bits]
+        for step, passes in enumerate(passed.unbind(1)):
+            kept = self.bits & passes
+            spared = kept.amax(0).logical_not_()  # where nobody passes, everybody stays
+            if closed is not None:
+                spared |= closed[step]
+            self.bits = kept.bitwise_or_(self.bits * spared)
+            history.append(self.bits)
+        narrowed = torch.stack(history).diff(dim=0).amax(1) > 0
+        return narrowed, BLOCK_NS + passed.numel()
+
+    def sizes(self) -> Tensor:
+        """Members left in each pool, ``[selection]``."""
+        return self.ones[self.bits.long()].sum(0)
+
+    def keep(self, selections: Tensor) -> None:
+        """Go on with the selections at these indices only."""
+        self.bits = self.bits[:, selections]
+
+    def members(self, selections: Tensor) -> tuple[Tensor, Tensor]:
+        """Who is in these pools, as pairs: (position in ``selections``, member), ``[pair]`` each."""
+        bits = self.bits[:, selections]
+        byte, owner = bits.nonzero().unbind(1)
+        shifts = torch.arange(8, dtype=torch.uint8, device=bits.device)
+        pair, bit = ((bits[byte, owner][:, None] >> shifts) & 1).nonzero().unbind(1)
+        return owner[pair], 8 * byte[pair] + bit
+
+
+def _pack(flags: Tensor) -> Tensor:
+    """Put eight rows of 0 and 1 into one row of bytes: ``[member, case] -> [member / 8, case]``."""
+    packed = flags.new_empty(-(-len(flags) // 8), flags.shape[1])
+    rows = max(1, 2**17 // flags.shape[1])  # so that a part stays in the processor's cache
+    for bytes_, part in zip(packed.split(rows), flags.split(8 * rows), strict=True):
+        if len(part) % 8:
+            # The last member fills the byte up: unlike zeros it splits no case by itself.
+            part = torch.cat([part, part[-1:].expand(-len(part) % 8, -1)])
+        lanes = part.view(-1, 8, part.shape[1]).unbind(1)
+        bytes_.copy_(lanes[0])
+        for lane in range(1, 8):
+            bytes_.add_(lanes[lane], alpha=2**lane)
+    return packed
+
+
+class ScorePools:
+    """Pools of members with real scores, as a list of (selection, member) pairs.
+
+    Few members share the best score of a case, so these pools are small after the first one.
+
+    Args:
+        scores: ``[member, case]``, higher is better.
+        epsilon: How far from the best of its pool a member may be; None means not at all.
+        cases: Cases on which the members differ, ``[case]``.
+    """
+
+    block = 2
+
+    def __init__(self, scores: Tensor, epsilon: Epsilon | None, cases: Tensor) -> None:
+        self.scores = scores.contiguous()
+        self.epsilon = epsilon
+        self.cases = cases
+        self.chunk = max(1, 2**22 // len(scores))
+        floating = scores.dtype.is_floating_point
+        self.lowest = -torch.inf if floating else torch.iinfo(scores.dtype).min
+
+    def open(self, num_selections: int) -> None:
+        """Start this many selections, each with every member in its pool."""
+        self.member: Tensor | None = None  # nobody is out yet: the pairs need no listing
+        self.size = self.cases.new_full((num_selections,), len(self.scores))
+
+    def narrow(self, cases: Tensor, closed: Tensor | None) -> tuple[Tensor, float]:
+        """Filter each pool by its cases in turn; see `PassPools.narrow`."""
+        tolerances = None if self.epsilon is None else self.epsilon.at(cases)
+        narrowed, work = [], BLOCK_NS
+        for step, case in enumerate(cases):
+            if self.member is None:
+                values = self.scores.gather(1, case.expand(len(self.scores), -1))
+                bar = values.amax(0)
+            else:
+                place = self.member * self.scores.shape[1] + case.gather(0, self.owner)
+                values = self.scores.view(-1).gather(0, place)
+                bar = values.new_full(case.shape, self.lowest)
+                bar.scatter_reduce_(0, self.owner, values, "amax")
+            if tolerances is not None:
+                bar = bar - tolerances[step]
+            kept = values >= (bar if self.member is None else bar.gather(0, self.owner))
+            if closed is not None:
+                kept |= closed[step] if self.member is None else closed[step].gather(0, self.owner)
+            if self.member is None:
+                self.member, self.owner = kept.nonzero().unbind(1)
+            else:
+                stay = kept.nonzero()[:, 0]
+                self.member, self.owner = self.member.gather(0, stay), self.owner.gather(0, stay)
+            before, self.size = self.size, self.owner.bincount(minlength=len(case))
+            narrowed.append(self.size < before)
+            work += 30 * len(values)
+        return torch.stack(narrowed), work
+
+    def sizes(self) -> Tensor:
+        """Members left in each pool, ``[selection]``."""
+        return self.size
+
+    def keep(self, selections: Tensor) -> None:
+        """Go on with the selections at these indices only."""
+        self.owner, self.member = self.members(selections)
+        self.size = self.size[selections]
+
+    def members(self, selections: Tensor) -> tuple[Tensor, Tensor]:
+        """Who is in these pools; see `PassPools.members`."""
+        assert self.member is not None
+        position = self.owner.new_full(self.size.shape, -1)
+        position[selections] = torch.arange(len(selections), device=position.device)
+        owner = position.gather(0, self.owner)
+        wanted = (owner >= 0).nonzero()[:, 0]
+        return owner.gather(0, wanted), self.member.gather(0, wanted)
+
+
+class Round:
+    """One round of selections among behaviours.
+
+    Args:
+        pools: The behaviours' scores, in the form that suits them.
+        weights: Members that share each behaviour, ``[behaviour]``.
+        limit: Cases that each selection may look at.
+        generator: Source of the case orders and of the tie breaks.
+    """
+
+    def __init__(
+        self,
+        pools: PassPools | ScorePools,
+        weights: Tensor,
+        *,
+        limit: int,
+        generator: torch.Generator,
+    ) -> None:
+        self.pools = pools
+        self.weights = weights
+        self.limit = limit
+        self.generator = generator
+        self.device = weights.device
+        self.num_cases = pools.scores.shape[1]
+        self.splitting: dict[tuple[int, ...], Tensor] = {}
+
+    def select(self, num_selected: int) -> tuple[Tensor, Tensor]:
+        """Select behaviours.
+
+        Returns:
+            The behaviour chosen by each selection, and the place in its order of the last case
+            that removed a member (0 if none did), ``[num_selected]`` each.
+        """
+        self.depth = torch.zeros(num_selected, dtype=torch.long, device=self.device)
+        self.ended: list[tuple[Tensor, Tensor]] = []  # (selection, behaviour) pairs
+        selections = torch.arange(num_selected, device=self.device)
+        if len(self.pools.cases):
+            for part in selections.split(self.pools.chunk):
+                self._run(part)
+        else:
+            everyone = torch.arange(len(self.weights), device=self.device)
+            self.ended = [(selections.repeat_interleave(len(everyone)), everyone.repeat(num_selected))]
+        return self._choose(), self.depth
+
+    def _run(self, selections: Tensor) -> None:
+        pools, cases = self.pools, self.pools.cases
+        pools.open(len(selections))
+        looked = torch.zeros_like(selections)  # length of the order so far
+        skipped = torch.zeros_like(selections)  # how much of it splits no pool at all
+        drawn = selections.new_empty(0, len(selections))
+        spent, landmark = 0.0, torch.inf
+        while len(selections):
+            shape = (pools.block, len(selections))
+            draws = torch.randint(len(cases), shape, generator=self.generator, device=self.device)
+            drawn = torch.cat([drawn, draws])
+            places, skipped = self._places(drawn, draws, looked, skipped)
+            looked = places[-1]
+            closed = places > self.limit if self.limit < self.num_cases else None
+            narrowed, work = pools.narrow(cases[draws], closed)
+            last = (places * narrowed).amax(0)
+            self.depth[selections] = torch.where(last > 0, last, self.depth[selections])
+
+            sizes = pools.sizes()
+            done = (sizes == 1) | (looked >= self.limit)
+            over, left = done.nonzero()[:, 0], (~done).nonzero()[:, 0]
+            if len(over):
+                owner, member = pools.members(over)
+                self.ended.append((selections[over][owner], member))
+                pools.keep(left)
+                selections, looked, skipped = selections[left], looked[left], skipped[left]
+                drawn = drawn[:, left]
+
+            # Draw on while the pools shrink. When they stop, go on only until the draws have cost
+            # as much as settling would: then the total is never far from the cheaper of the two.
+            pairs = int(sizes.sum()) - len(over)
+            spent += work
+            if pairs <= landmark / 2:
+                spent, landmark = 0.0, pairs
+            elif spent >= self._settling_work(len(selections), pairs):
+                break
+        if len(selections):
+            owner, member = pools.members(torch.arange(len(selections), device=self.device))
+            members = member[owner.argsort(stable=True)].split(pools.sizes().tolist())
+            for selection, place, pool in zip(selections, looked.tolist(), members, strict=True):
+                self._settle(selection, place, pool)
+
+    def _places(
+        self, drawn: Tensor, draws: Tensor, looked: Tensor, skipped: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Place of each draw in its selection's order of all cases, ``[step, selection]``.
+
+        A case drawn again takes no new place. The cases that were set aside because they split
+        nobody stand in the order too, between the draws.
+        """
+        earlier = draws.new_ones(len(draws), len(drawn), dtype=torch.bool)
+        earlier = earlier.tril(len(drawn) - len(draws) - 1)
+        fresh = ~((drawn == draws[:, None]) & earlier[:, :, None]).any(1)
+        aside = self.num_cases - len(self.pools.cases)
+        if not aside:
+            return looked + fresh.cumsum(0), skipped
+        places = torch.empty_like(draws)
+        for step in range(len(draws)):
+            unseen = len(self.pools.cases) - (looked - skipped)
+            gap = self._gap(unseen, aside - skipped) * fresh[step]
+            skipped = skipped + gap
+            looked = looked + gap + fresh[step]
+            places[step] = looked
+        return places, skipped
+
+    def _gap(self, wanted: Tensor, others: Tensor) -> Tensor:
+        """Draw how many of ``others`` stand before the first of ``wanted`` in a random order.
+
+        Give each case a uniform time of arrival; the first of n arrives at 1 - U ** (1 / n).
+        """
+        chance = torch.rand(
+            wanted.shape, generator=self.generator, device=self.device, dtype=torch.float64
+        )
+        first = 1 - chance ** (1 / wanted)
+        return torch.binomial(others.double(), first, generator=self.generator).long()
+
+    def _settling_work(self, num_selections: int, pairs: int) -> float:
+        work = SETTLE_NS * num_selections + 0.5 * pairs * self.num_cases
+        if self.pools.epsilon is not None:
+            work += 30.0 * self.pools.epsilon.missing * len(self.pools.epsilon.scores)
+        return work
+
+    def _settle(self, selection: Tensor, looked: int, pool: Tensor) -> None:
+        """Finish one selection by drawing only cases that split its pool.
+
+        None of them has been in the order yet: what a case has kept, it keeps.
+        """
+        scores, epsilon = self.pools.scores, self.pools.epsilon
+        while True:
+            key = tuple(pool.tolist())
+            if key not in self.splitting:
+                rows = scores[pool]
+                bar = rows.amax(0)
+                if epsilon is not None:
+                    bar = bar - epsilon.at(torch.arange(self.num_cases, device=self.device))
+                self.splitting[key] = (rows.amin(0) < bar).nonzero()[:, 0]
+            cases = self.splitting[key]
+            if not len(cases):
+                break
+            wanted = looked_at = torch.tensor(len(cases), device=self.device)
+            looked += 1 + int(self._gap(wanted, self.num_cases - looked - looked_at))
+            if looked > self.limit:
+                break
+            self.depth[selection] = looked
+            draw = torch.randint(len(cases), (), generator=self.generator, device=self.device)
+            case = cases[draw]
+            values = scores[pool, case]
+            bar = values.amax() if epsilon is None else values.amax() - epsilon.at(case)
+            pool = pool[values >= bar]
+        self.ended.append((selection.expand(len(pool)), pool))
+
+    def _choose(self) -> Tensor:
+        """Draw one behaviour of the pool each selection ended with, by the members behind it."""
+        owner = torch.cat([owner for owner, _ in self.ended])
+        member = torch.cat([member for _, member in self.ended])
+        order = owner.argsort(stable=True)
+        member = member[order]
+        mass = self.weights[member].cumsum(0)
+        end = mass[owner.bincount().cumsum(0) - 1]
+        start = torch.cat([end.new_zeros(1), end[:-1]])
+        chance = torch.rand(
+            len(end), generator=self.generator, device=self.device, dtype=torch.float64
+        )
+        ticket = start + (chance * (end - start)).long()
+        return member[torch.searchsorted(mass, ticket, right=True)]

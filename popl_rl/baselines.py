@@ -1,0 +1,91 @@
+"""What POPL is compared with: pooled CPL, and CPL that knows the groups (the oracle)."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from popl_rl.comparisons import Comparisons
+from popl_rl.losses import CPLLoss, descend
+from popl_rl.policies import PolicySpec
+from popl_rl.policy_set import PolicySet
+from popl_rl.population import Population
+from popl_rl.segments import SegmentBank
+
+__all__ = ["group_weights", "train_cpl"]
+
+
+def group_weights(group: Tensor, num_groups: int) -> Tensor:
+    """Weights of a pooled policy and of one oracle per group, ``[1 + G, M]``.
+
+    The oracle reads hidden labels: it is the ceiling for methods that do not.
+
+    Args:
+        group: Hidden group of each comparison, ``[M]``.
+        num_groups: Number of groups G.
+
+    Raises:
+        ValueError: If some group made no comparison.
+    """
+    oracle = torch.nn.functional.one_hot(group, num_groups).T.float()
+    silent = (oracle.sum(1) == 0).nonzero().squeeze(-1).tolist()
+    if silent:
+        raise ValueError(
+            f"groups {silent} have no strict answer, so no oracle can be trained for them; draw "
+            "more raters or give those groups a larger share"
+        )
+    return torch.cat([torch.ones(1, len(group)), oracle])
+
+
+def train_cpl(
+    spec: PolicySpec,
+    bank: SegmentBank,
+    comparisons: Comparisons,
+    weight: Tensor,
+    *,
+    steps: int = 1500,
+    batch_size: int = 256,
+    learning_rate: float = 2e-3,
+    alpha: float = 0.5,
+    conservatism: float = 0.9,
+    discount: float = 1.0,
+    generator: torch.Generator,
+    progress: Callable[[int], None] | None = None,
+) -> PolicySet:
+    """Train plain CPL policies (arXiv 2310.13639), several at once.
+
+    Args:
+        spec: Sizes of the policies.
+        bank: Segments.
+        comparisons: M strict preferences.
+        weight: How often each policy draws each preference, ``[K, M]``.
+        steps: Gradient steps.
+        batch_size: Preferences per policy and step.
+        learning_rate: Adam's step size.
+        alpha: Scale of the scores.
+        conservatism: Lambda of the CPL loss.
+        discount: Per-step discount of the scores.
+        generator: Source of initial weights and batches.
+        progress: Called with the number of steps done.
+
+    Returns:
+        K policies, in the order of ``weight``.
+    """
+    population = Population.create(spec, len(weight), generator=generator).to(weight.device)
+    loss = CPLLoss(
+        population, bank, alpha=alpha, conservatism=conservatism, discount=discount
+    )
+    optimizer = torch.optim.Adam(population.members.parameters(), lr=learning_rate)
+    for done in range(0, steps, 50):
+        descend(
+            loss,
+            optimizer,
+            comparisons,
+            steps=min(50, steps - done),
+            batch_size=batch_size,
+            weight=weight,
+            generator=generator,
+        )
+        if progress is not None:
+            progress(min(done + 50, steps))
+    return PolicySet(population, alpha=alpha, discount=discount)

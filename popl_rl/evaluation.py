@@ -1,0 +1,188 @@
+"""What the policies do, and what that is worth to each hidden group."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from popl_rl.keys import ANSWER, INFO, OBSERVATION, PAIR, Answer
+from popl_rl.policy_set import PolicySet
+from popl_rl.preferences import draw_pairs
+from popl_rl.raters import RaterGroup, Raters
+from popl_rl.rollouts import MASK, lockstep
+
+__all__ = [
+    "group_accuracy",
+    "group_returns",
+    "held_out_pairs",
+    "info_rates",
+    "new_rater_answers",
+    "recovery",
+    "roll_out",
+]
+
+
+def roll_out(
+    make_env: Callable[[], gymnasium.Env[Any, Any]],
+    policies: PolicySet | None,
+    *,
+    episodes: int,
+    max_steps: int,
+    seed: int,
+    greedy: bool = False,
+    random_action: Callable[[TensorDictBase, torch.Generator], Tensor] | None = None,
+) -> TensorDict:
+    """Roll every policy from the same starts, all in lockstep.
+
+    Args:
+        make_env: Builds one environment.
+        policies: P policies; None to roll ``random_action`` instead, as one policy.
+        episodes: Episodes E per policy; episode e starts from the same seed for all policies.
+        max_steps: Steps H after which an episode is cut.
+        seed: Seed of the starts and of the sampled actions.
+        greedy: Take the most likely actions instead of sampling.
+        random_action: A behaviour to roll without policies.
+
+    Returns:
+        TensorDict ``[P, E, H]`` as from :func:`~popl_rl.rollouts.lockstep`.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1, got {episodes}")
+    generator = torch.Generator().manual_seed(seed)
+    starts = torch.randint(2**31, (episodes,), generator=generator).tolist()
+    count = 1 if policies is None else len(policies)
+
+    def act(step: TensorDictBase) -> Tensor:
+        if policies is None:
+            assert random_action is not None
+            return random_action(step, generator)
+        observation = step[OBSERVATION].unflatten(0, (count, episodes))
+        action = policies.act(
+            observation.to(policies.population.device), greedy=greedy, generator=generator
+        )
+        return action.flatten(0, 1).cpu()
+
+    envs = [make_env() for _ in range(count * episodes)]
+    try:
+        flat = lockstep(envs, act, seeds=starts * count, max_steps=max_steps)
+    finally:
+        for env in envs:
+            env.close()
+    return flat.unflatten(0, (count, episodes))
+
+
+def group_returns(episodes: TensorDictBase, groups: Sequence[RaterGroup]) -> Tensor:
+    """Mean undiscounted utility of an episode to each group.
+
+    Args:
+        episodes: ``[P, E, H]``.
+        groups: G groups.
+
+    Returns:
+        ``[P, G]``.
+    """
+    flat = episodes.flatten(0, 1)
+    mask = flat[MASK].float()
+    worth = [(group.step_utility(flat) * mask).sum(1) for group in groups]
+    return torch.stack(worth, -1).unflatten(0, episodes.shape[:2]).mean(1)
+
+
+def info_rates(episodes: TensorDictBase, key: str) -> dict[int, Tensor]:
+    """Share of episodes in which an integer info ever took each value, ``value -> [P]``."""
+    value, mask = episodes[INFO, key], episodes[MASK]
+    seen = value[mask].unique().tolist()
+    return {int(v): ((value == v) & mask).any(-1).float().mean(-1) for v in seen}
+
+
+def success_rate(episodes: TensorDictBase, key: str) -> Tensor:
+    """Share of episodes in which info ``key`` was ever positive, ``[P]``; NaN without that key."""
+    if key not in episodes[INFO].keys():
+        return torch.full(episodes.shape[:1], float("nan"))
+    return ((episodes[INFO, key] > 0) & episodes[MASK]).any(-1).float().mean(-1)
+
+
+def recovery(value: Tensor, *, random: Tensor, oracle: Tensor) -> Tensor:
+    """``(return - random) / (oracle - random)``: 1 is the oracle's, 0 a random policy's return."""
+    return (value - random) / (oracle - random)
+
+
+def held_out_pairs(
+    worth: Tensor, group: int, *, count: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Fresh pairs on which a group has a strict opinion, and no rater's noise.
+
+    Args:
+        worth: Worth of each stored segment to each group, ``[G, N]``.
+        group: Which group.
+        count: Pairs to draw; those of (nearly) equal worth are dropped.
+        generator: Source of the pairs.
+
+    Returns:
+        Preferred and other segments, each ``[count or fewer]``.
+    """
+    pair = draw_pairs(worth.shape[1], count, generator=generator)
+    first, second = worth[group][pair].unbind(-1)
+    strict = (first - second).abs() > 1e-6
+    swap = (first < second)[strict]
+    pair = pair[strict]
+    pair = torch.where(swap.unsqueeze(-1), pair.flip(-1), pair)
+    return pair[:, 0], pair[:, 1]
+
+
+def group_accuracy(scores: Tensor, pairs: Mapping[int, tuple[Tensor, Tensor]]) -> Tensor:
+    """Share of each group's strict pairs that each policy ranks right; a tie is not right.
+
+    Args:
+        scores: Segment scores, ``[P, N]``.
+        pairs: Preferred and other segments of each group.
+
+    Returns:
+        ``[P, G]``.
+    """
+    columns = [(scores[:, better] > scores[:, worse]).float().mean(1) for better, worse in pairs.values()]
+    return torch.stack(columns, -1)
+
+
+def new_rater_answers(
+    groups: Sequence[RaterGroup],
+    group: int,
+    worth: Tensor,
+    *,
+    answers: int,
+    generator: torch.Generator,
+) -> TensorDict:
+    """Strict answers of a new rater of one group, noisy as that group's raters are.
+
+    Args:
+        groups: G groups.
+        group: The new rater's group.
+        worth: ``[G, N]``.
+        answers: Number of strict answers; ties and skips are asked again.
+        generator: Source of the pairs and of the rater's randomness.
+
+    Returns:
+        TensorDict ``[answers]`` with ``pair`` and ``answer``.
+
+    Raises:
+        ValueError: If the rater keeps answering ties and skips.
+    """
+    person = Raters(tuple(groups), torch.tensor([group]))
+    pairs, replies, found = [], [], 0
+    for _ in range(100):
+        pair = draw_pairs(worth.shape[1], answers, generator=generator)
+        asked = torch.zeros(answers, dtype=torch.long)
+        reply = person.answer(pair, asked, worth, generator=generator)
+        strict = reply <= Answer.SECOND
+        pairs.append(pair[strict])
+        replies.append(reply[strict])
+        found += int(strict.sum())
+        if found >= answers:
+            data = {PAIR: torch.cat(pairs)[:answers], ANSWER: torch.cat(replies)[:answers]}
+            return TensorDict(data, [answers])
+    raise ValueError(
+        f"a rater of group {groups[group].name!r} gave {found} strict answers to {100 * answers} "
+        "queries, too few to cater to; lower the tie and skip thresholds"
+    )

@@ -1,0 +1,51 @@
+"""Every TensorDict key of the package with its shape, in one table.
+
+Segments, batch size ``[N]`` (N segments of T steps):
+
+| key | shape | dtype | what |
+|---|---|---|---|
+| ``observation`` | ``[N, T, O]`` | float32 | what the policy sees before each step |
+| ``action`` | ``[N, T]`` or ``[N, T, A]`` | int64 or float32 | what was done |
+| ``reward`` | ``[N, T]`` | float32 | the environment's own reward, for raters that use it |
+| ``("info", name)`` | ``[N, T]`` | float32 or int64 | each number the environment's ``info`` gives |
+
+Preferences, batch size ``[M]``:
+
+| key | shape | dtype | what |
+|---|---|---|---|
+| ``pair`` | ``[M, 2]`` | int64 | rows of the two segments that were compared |
+| ``answer`` | ``[M]`` | int64 | an :class:`Answer` |
+| ``rater`` | ``[M]`` | int64 | id of the person who answered |
+| ``("hidden", "group")`` | ``[M]`` | int64 | group of that person. For evaluation only |
+| ``("hidden", "utility")`` | ``[M, 2]`` | float32 | what each segment is worth to that group. For evaluation only |
+"""
+
+from enum import IntEnum
+
+from tensordict.utils import NestedKey
+
+OBSERVATION = "observation"
+ACTION = "action"
+REWARD = "reward"
+INFO = "info"
+PAIR = "pair"
+ANSWER = "answer"
+RATER = "rater"
+HIDDEN = "hidden"
+GROUP = (HIDDEN, "group")
+UTILITY = (HIDDEN, "utility")
+
+SEGMENT_KEYS: tuple[NestedKey, ...] = (OBSERVATION, ACTION, REWARD, INFO)
+#: What a learner may read of a preference.
+LEARNER_KEYS: tuple[NestedKey, ...] = (PAIR, ANSWER, RATER)
+#: What only an evaluation may read.
+HIDDEN_KEYS: tuple[NestedKey, ...] = (GROUP, UTILITY)
+
+
+class Answer(IntEnum):
+    """What a rater said about a pair; the first two are the position of the preferred segment."""
+
+    FIRST = 0
+    SECOND = 1
+    TIE = 2
+    SKIP = 3

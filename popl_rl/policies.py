@@ -1,0 +1,137 @@
+"""Policy networks and TorchRL actors, built from an environment's spaces."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torch.distributions import Categorical
+from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor
+
+from popl_rl.keys import ACTION, OBSERVATION
+
+__all__ = ["PolicySpec", "build_actor", "build_network", "log_prob"]
+
+
+@dataclass(frozen=True)
+class PolicySpec:
+    """Everything needed to rebuild a policy network.
+
+    Attributes:
+        observation_dim: Length O of an observation vector.
+        action_dim: Number of actions if ``discrete``, else the length A of an action vector.
+        discrete: Whether actions are a choice of one among ``action_dim``.
+        hidden: Units of each hidden layer. Empty for a linear policy.
+        action_std: Standard deviation of the Gaussian of a continuous policy. The default makes
+            its log-density ``-|mu(s) - a|^2`` up to a constant, the form CPL uses (arXiv
+            2310.13639, section 4). Unused when ``discrete``.
+    """
+
+    observation_dim: int
+    action_dim: int
+    discrete: bool
+    hidden: tuple[int, ...] = (64, 64)
+    action_std: float = 0.5**0.5
+
+    def __post_init__(self) -> None:
+        for name in ("observation_dim", "action_dim"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if any(units < 1 for units in self.hidden):
+            raise ValueError(f"hidden must hold layer widths of at least 1, got {self.hidden}")
+        if not self.action_std > 0:
+            raise ValueError(f"action_std must be positive, got {self.action_std}")
+
+    @classmethod
+    def from_env(
+        cls,
+        env: gymnasium.Env[Any, Any],
+        *,
+        hidden: Sequence[int] = (64, 64),
+        action_std: float = 0.5**0.5,
+    ) -> "PolicySpec":
+        """Read the sizes off a Gymnasium environment's spaces.
+
+        Raises:
+            TypeError: If observations are not a flat ``Box`` or actions neither ``Discrete`` nor a
+                flat ``Box``.
+        """
+        observation, action = env.observation_space, env.action_space
+        if not isinstance(observation, gymnasium.spaces.Box) or len(observation.shape) != 1:
+            raise TypeError(
+                f"observation_space must be a Box of one dimension, got {observation}; flatten it, "
+                "for example with gymnasium.wrappers.FlattenObservation"
+            )
+        if isinstance(action, gymnasium.spaces.Discrete):
+            size, discrete = int(action.n), True
+        elif isinstance(action, gymnasium.spaces.Box) and len(action.shape) == 1:
+            size, discrete = action.shape[0], False
+        else:
+            raise TypeError(f"action_space must be Discrete or a Box of one dimension, got {action}")
+        return cls(observation.shape[0], size, discrete, tuple(hidden), action_std)
+
+
+def build_network(spec: PolicySpec, *, generator: torch.Generator) -> nn.Sequential:
+    """Build one policy network, ``[..., O] -> [..., action_dim]`` (logits or mean action).
+
+    Args:
+        spec: Sizes of the network.
+        generator: Source of the initial weights.
+
+    Returns:
+        The layers of a TorchRL ``MLP`` with ReLU activations.
+    """
+    seed = int(torch.randint(2**62, (), generator=generator, device=generator.device))
+    # torch.nn initialises from the global generator only, so lend it a seed of ours.
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        layers = MLP(
+            in_features=spec.observation_dim,
+            out_features=spec.action_dim,
+            num_cells=list(spec.hidden),
+            activation_class=nn.ReLU,
+        )
+    # A plain Sequential, because an MLP cannot be sliced into trunk and head.
+    return nn.Sequential(*layers)
+
+
+def build_actor(spec: PolicySpec, network: nn.Module) -> ProbabilisticActor:
+    """Wrap a network as a TorchRL actor that reads ``observation`` and writes ``action``."""
+    if spec.discrete:
+        module = TensorDictModule(network, in_keys=[OBSERVATION], out_keys=["logits"])
+        return ProbabilisticActor(module, in_keys=["logits"], distribution_class=Categorical)
+
+    class Gaussian(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.network = network
+
+        def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+            mean = self.network(observation)
+            return mean, torch.full_like(mean, spec.action_std)
+
+    module = TensorDictModule(Gaussian(), in_keys=[OBSERVATION], out_keys=["loc", "scale"])
+    return ProbabilisticActor(
+        module, in_keys=["loc", "scale"], distribution_class=IndependentNormal, out_keys=[ACTION]
+    )
+
+
+def log_prob(spec: PolicySpec, output: Tensor, action: Tensor) -> Tensor:
+    """Log-probability of actions under network outputs.
+
+    Args:
+        spec: Kind of policy.
+        output: Logits or mean actions, ``[..., action_dim]``.
+        action: Actions, ``[...]`` int64 if discrete, else ``[..., A]``; broadcast to ``output``.
+
+    Returns:
+        ``[...]``. For continuous policies without the Gaussian's constant, which is the same for
+        every policy and cancels in every comparison of segments of equal length.
+    """
+    if spec.discrete:
+        chosen = action.expand(output.shape[:-1]).unsqueeze(-1)
+        return output.log_softmax(-1).gather(-1, chosen).squeeze(-1)
+    return -(output - action).square().sum(-1) / (2 * spec.action_std**2)

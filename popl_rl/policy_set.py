@@ -1,0 +1,292 @@
+"""The result of training: a set of policies, and choosing from it for one person or for all."""
+
+import json
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+import torch.nn.functional as F  # noqa: N812 - the name everyone knows
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.modules import ProbabilisticActor
+
+from popl_rl.comparisons import Comparisons
+from popl_rl.lexicase import lexicase_selection
+from popl_rl.policies import PolicySpec, build_actor, build_network
+from popl_rl.popl import case_values, margins
+from popl_rl.population import Population
+from popl_rl.segments import SegmentBank, load_tensordict, save_tensordict
+
+__all__ = ["Catered", "PolicySet"]
+
+_FORMAT = "popl_rl.policy_set/1"
+
+
+@dataclass(frozen=True)
+class Catered:
+    """A choice from a policy set for one rater.
+
+    Attributes:
+        member: The chosen policy.
+        weights: Belief in each policy, ``[N]``, summing to 1.
+    """
+
+    member: int
+    weights: Tensor
+
+
+class PolicySet:
+    """Policies of which every hidden group should find its own.
+
+    Args:
+        population: The policies.
+        alpha: Scale of their scores, as trained.
+        discount: Per-step discount of their scores.
+
+    Example:
+        >>> policies = PolicySet.load("runs/mine/policies")  # doctest: +SKIP
+        >>> choice = policies.cater(segments, answers)  # doctest: +SKIP
+        >>> action = policies.act(observation, member=choice.member)  # doctest: +SKIP
+    """
+
+    def __init__(
+        self, population: Population, *, alpha: float = 0.5, discount: float = 1.0
+    ) -> None:
+        self.population = population
+        self.alpha = alpha
+        self.discount = discount
+
+    @classmethod
+    def distinct(
+        cls,
+        population: Population,
+        bank: SegmentBank,
+        comparisons: Comparisons,
+        *,
+        alpha: float = 0.5,
+        discount: float = 1.0,
+    ) -> "PolicySet":
+        """Keep one member for each distinct behaviour (pass or not, on every comparison)."""
+        passes = margins(population, bank, comparisons, alpha=alpha, discount=discount) > 0
+        inverse = passes.unique(dim=0, return_inverse=True)[1].tolist()
+        first = sorted({behaviour: inverse.index(behaviour) for behaviour in inverse}.values())
+        return cls(population.subset(first), alpha=alpha, discount=discount)
+
+    def __len__(self) -> int:
+        return len(self.population)
+
+    def effective_number(self, bank: SegmentBank, comparisons: Comparisons) -> float:
+        """How many clearly different policies there are, between 1 and ``len(self)``.
+
+        The similarity-sensitive diversity of order 2 (Leinster and Cobbold, 2012), ``1 / sum_ij
+        p_i Z_ij p_j`` with equal shares p; two members are as similar as the agreement of their
+        passes exceeds chance, ``Z = max(0, 2 agreement - 1)``.
+        """
+        sign = (self._margins(bank, comparisons) > 0).float() * 2 - 1
+        similarity = (sign @ sign.T / sign.shape[1]).clamp(min=0)
+        return float(1 / similarity.mean())
+
+    def _margins(self, bank: SegmentBank, comparisons: Comparisons) -> Tensor:
+        return margins(
+            self.population, bank, comparisons, alpha=self.alpha, discount=self.discount
+        )
+
+    @torch.no_grad()
+    def act(
+        self,
+        observation: Tensor,
+        *,
+        member: int | None = None,
+        greedy: bool = False,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Choose actions.
+
+        Args:
+            observation: ``[O]`` or ``[B, O]``; without ``member`` also ``[N, B, O]``, each policy
+                its own.
+            member: Whose actions; every policy's if None.
+            greedy: Take the most likely action rather than sample. Continuous policies always
+                give their mean.
+            generator: Needed to sample.
+
+        Returns:
+            Actions ``[...]`` (discrete) or ``[..., A]``, with ``N`` in front if ``member`` is None.
+
+        Raises:
+            IndexError: If there is no such member.
+            ValueError: If it must sample without a generator.
+        """
+        single = observation.ndim == 1
+        batch = observation.unsqueeze(0) if single else observation
+        if member is None:
+            output = self.population(batch)
+        else:
+            if not 0 <= member < len(self):
+                raise IndexError(f"member must be in 0..{len(self) - 1}, got {member}")
+            output = self.population.subset([member])(batch)[0]
+        if not self.population.spec.discrete:
+            action = output
+        elif greedy:
+            action = output.argmax(-1)
+        elif generator is None:
+            raise ValueError("generator must be given to sample actions; or pass greedy=True")
+        else:
+            flat = output.softmax(-1).flatten(0, -2)
+            action = torch.multinomial(flat, 1, generator=generator).view(output.shape[:-1])
+        return action.squeeze(-1 if self.population.spec.discrete else -2) if single else action
+
+    def actor(self, member: int) -> ProbabilisticActor:
+        """One policy as a TorchRL actor, for collectors and further training."""
+        return build_actor(self.population.spec, self.population.network(member))
+
+    def cater(
+        self,
+        segments: TensorDictBase | SegmentBank,
+        answers: TensorDictBase,
+        *,
+        method: Literal["posterior", "lexicase"] = "posterior",
+        mistake: float = 0.05,
+        generator: torch.Generator | None = None,
+    ) -> Catered:
+        """Choose a policy for one rater from a few answers.
+
+        Args:
+            segments: What the answers are about.
+            answers: TensorDict ``[K]`` with ``pair`` and ``answer``; ties and skips are ignored.
+            method: ``"posterior"``: belief ``w_n ~ prod_k p(answer_k | Delta_nk)`` with ``p = (1 -
+                mistake) sigmoid(Delta) + mistake sigmoid(-Delta)``, and the policy believed in
+                most. ``"lexicase"``: one lexicase selection over the answers, as in the POPL
+                paper; needs ``generator``.
+            mistake: Chance of a slip, which keeps single answers from ruling a policy out.
+            generator: Source of the lexicase draw.
+
+        Raises:
+            ValueError: If no answer is strict, or the arguments are off.
+        """
+        bank = (
+            segments
+            if isinstance(segments, SegmentBank)
+            else SegmentBank.from_segments(segments)
+        )
+        comparisons = Comparisons.from_preferences(answers, cases="preference")
+        margin = self._margins(bank, comparisons)
+        if method == "posterior":
+            if not 0 <= mistake < 0.5:
+                raise ValueError(f"mistake must be in [0, 0.5), got {mistake}")
+            probability = (1 - mistake) * margin.sigmoid() + mistake * (-margin).sigmoid()
+            log_weight = probability.clamp(min=1e-12).log().sum(1)
+            return Catered(int(log_weight.argmax()), log_weight.softmax(0))
+        if method == "lexicase":
+            if generator is None:
+                raise ValueError("generator must be given for lexicase catering")
+            member = int(lexicase_selection(margin > 0, 1, generator=generator))
+            return Catered(member, F.one_hot(torch.tensor(member), len(self)).float())
+        raise ValueError(f"method must be 'posterior' or 'lexicase', got {method!r}")
+
+    def fair(
+        self,
+        segments: TensorDictBase | SegmentBank,
+        answers: TensorDictBase,
+        *,
+        quantile: float = 0.1,
+    ) -> int:
+        """The one policy that does best by the raters it serves worst.
+
+        Args:
+            segments: What the answers are about.
+            answers: TensorDict ``[M]`` with ``pair``, ``answer`` and ``rater``.
+            quantile: Quantile over raters of a policy's accuracy that is maximised; 0.1 as in the
+                POPL paper, 0 for the minimum.
+
+        Raises:
+            ValueError: If ``quantile`` is outside [0, 1] or no answer is strict.
+        """
+        if not 0 <= quantile <= 1:
+            raise ValueError(f"quantile must be in [0, 1], got {quantile}")
+        bank = (
+            segments
+            if isinstance(segments, SegmentBank)
+            else SegmentBank.from_segments(segments)
+        )
+        comparisons = Comparisons.from_preferences(answers, cases="rater")
+        values = case_values(self._margins(bank, comparisons) > 0, comparisons)
+        return int(values.quantile(quantile, dim=1).argmax())
+
+    def save(self, path: Path | str) -> None:
+        """Write the set as tensors and JSON; nothing is left half-written.
+
+        Raises:
+            FileExistsError: If ``path`` exists.
+        """
+        path = Path(path)
+        if path.exists():
+            raise FileExistsError(f"{path} exists; remove it or choose another path")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        beside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+        try:
+            whole = beside / "set"
+            whole.mkdir()
+            population = self.population
+            save_tensordict(population.members.data, whole / "members")
+            trunk = {name: value.tolist() for name, value in population.trunk.state_dict().items()}
+            about = {
+                "format": _FORMAT,
+                "members": len(self),
+                "spec": asdict(population.spec),
+                "evolve": population.evolve,
+                "alpha": self.alpha,
+                "discount": self.discount,
+                "trunk": trunk,
+            }
+            (whole / "policy_set.json").write_text(json.dumps(about))
+            whole.rename(path)
+        finally:
+            shutil.rmtree(beside, ignore_errors=True)
+
+    @classmethod
+    def load(cls, path: Path | str) -> "PolicySet":
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            FileNotFoundError: If there is no policy set at ``path``.
+            ValueError: If it is truncated, damaged, or something else.
+        """
+        path = Path(path)
+        about_path = path / "policy_set.json"
+        if not about_path.is_file():
+            raise FileNotFoundError(
+                f"no policy set at {path}: expected the folder 'policies' of a finished run"
+            )
+        try:
+            about = json.loads(about_path.read_text())
+            if about["format"] != _FORMAT:
+                raise ValueError(f"unknown format {about['format']!r}")
+            spec = PolicySpec(**{**about["spec"], "hidden": tuple(about["spec"]["hidden"])})
+            generator = torch.Generator().manual_seed(0)
+            networks = [build_network(spec, generator=generator) for _ in range(about["members"])]
+            population = Population(networks, spec, evolve=about["evolve"])
+            trunk = {name: torch.tensor(value) for name, value in about["trunk"].items()}
+            population.trunk.load_state_dict(trunk)
+            members = load_tensordict(path / "members")
+            expected = population.members.data
+            for key in expected.keys(True, True):
+                if members[key].shape != expected[key].shape:
+                    raise ValueError(f"{key} has shape {tuple(members[key].shape)}")
+            expected.update_(members)
+        except (KeyError, TypeError, ValueError, RuntimeError, FileNotFoundError) as error:
+            raise ValueError(
+                f"{path} is not readable as a policy set ({error}); it is truncated or was "
+                "written by something else; train again or restore the folder"
+            ) from error
+        return cls(population, alpha=about["alpha"], discount=about["discount"])
+
+    def subset(self, members: Sequence[int]) -> "PolicySet":
+        """Some of the policies, in the given order."""
+        return PolicySet(
+            self.population.subset(members), alpha=self.alpha, discount=self.discount
+        )

@@ -1,0 +1,148 @@
+"""Pareto-optimal preference learning: score, select by lexicase, vary.
+
+POPL (Bahlous-Boldi, Ding, Spector, Niekum, arXiv 2406.15599) with policies that rank segments as
+CPL policies do. Nothing here reads or writes a file, and nothing knows who the raters are.
+"""
+
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from popl_rl.comparisons import Comparisons
+from popl_rl.lexicase import lexicase_report
+from popl_rl.population import Population, segment_scores
+from popl_rl.segments import SegmentBank
+from popl_rl.variation import Variation
+
+__all__ = ["POPL", "case_values", "margins", "rater_accuracy"]
+
+
+def margins(
+    population: Population,
+    bank: SegmentBank,
+    comparisons: Comparisons,
+    *,
+    alpha: float = 1.0,
+    discount: float = 1.0,
+) -> Tensor:
+    """Margins ``Delta = S(sigma+) - S(sigma-)`` of every member on every comparison, ``[N, M]``."""
+    scores = segment_scores(population, bank, alpha=alpha, discount=discount)
+    return scores[:, comparisons.preferred] - scores[:, comparisons.other]
+
+
+def case_values(passes: Tensor, comparisons: Comparisons) -> Tensor:
+    """Share of each case's comparisons that each member passes.
+
+    Args:
+        passes: ``[N, M]`` bool.
+        comparisons: The M comparisons and the case of each.
+
+    Returns:
+        ``[N, C]`` float32; 0 or 1 where a case is a single preference.
+    """
+    total = torch.zeros(len(passes), comparisons.num_cases, device=passes.device)
+    total.index_add_(1, comparisons.case, passes.float())
+    return total / comparisons.case.bincount(minlength=comparisons.num_cases).clamp(min=1)
+
+
+def rater_accuracy(values: Tensor, quantile: float = 0.1) -> float:
+    """A low quantile over cases of the best member's value: is anybody left out?
+
+    Needs no group labels: it is small as long as some raters find no member that serves them.
+    """
+    return float(values.amax(0).quantile(quantile))
+
+
+class POPL:
+    """One generation after the other: score, select, vary.
+
+    Args:
+        population: N policies, changed in place.
+        bank: Segments that the comparisons refer to.
+        comparisons: M strict preferences and the case of each.
+        variation: How children differ from their parents.
+        alpha: Scale of the scores, as in the CPL loss.
+        discount: Per-step discount of the scores.
+        epsilon: Tolerance of lexicase selection; ``"mad"``, a number, or None for none.
+        generator: Source of all randomness.
+
+    Attributes:
+        generation: Generations done so far.
+    """
+
+    def __init__(
+        self,
+        population: Population,
+        bank: SegmentBank,
+        comparisons: Comparisons,
+        *,
+        variation: Variation,
+        alpha: float = 0.5,
+        discount: float = 1.0,
+        epsilon: float | Literal["mad"] | None = "mad",
+        generator: torch.Generator,
+    ) -> None:
+        self.population = population
+        self.bank = bank
+        self.comparisons = comparisons
+        self.variation = variation
+        self.alpha = alpha
+        self.discount = discount
+        self.epsilon = epsilon
+        self.generator = generator
+        self.generation = 0
+
+    def step(self) -> dict[str, float]:
+        """Run one generation.
+
+        Returns:
+            Scalars to log: ``worst_rater_accuracy`` (10 % quantile over cases of the best
+            member's accuracy), ``mean_accuracy``, ``selection_depth`` (cases used per selection),
+            ``distinct`` and ``effective_parents``, and what the variation reports.
+        """
+        margin = margins(
+            self.population, self.bank, self.comparisons, alpha=self.alpha, discount=self.discount
+        )
+        passes = margin > 0
+        values = case_values(passes, self.comparisons)
+        tolerance = mad(values) if self.epsilon == "mad" else self.epsilon
+        report = lexicase_report(
+            values, len(self.population), epsilon=tolerance, generator=self.generator
+        )
+        strong = values >= values.amax(0) - (0.0 if tolerance is None else tolerance)
+        varied = self.variation(report.parents, strong.float()[:, self.comparisons.case])
+        self.generation += 1
+        return {
+            "worst_rater_accuracy": rater_accuracy(values),
+            "mean_accuracy": float(passes.float().mean()),
+            "selection_depth": float(report.depth.float().mean()),
+            "distinct": float(report.distinct),
+            "effective_parents": report.effective,
+            **varied,
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the next generation depends on."""
+        return {
+            "generation": self.generation,
+            "members": self.population.members.data.clone().to_dict(),
+            "variation": self.variation.state_dict(),
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from :meth:`state_dict`, bit for bit."""
+        self.generation = int(state["generation"])
+        self.population.members.data.update_(state["members"])
+        self.variation.load_state_dict(state["variation"])
+        self.generator.set_state(state["generator"].cpu())
+
+
+def mad(values: Tensor) -> Tensor:
+    """Median absolute deviation of each case over the population, ``[N, C] -> [C]``.
+
+    The tolerance of epsilon-lexicase selection (La Cava et al., 2016).
+    """
+    middle = values.median(0).values
+    return (values - middle).abs().median(0).values

@@ -1,0 +1,223 @@
+import pickle
+import sys
+from importlib.metadata import EntryPoint
+
+import pytest
+
+from popl_rl import registry
+from popl_rl.registry import env, names, rater, resolve
+
+GOOD = """
+from popl_rl.registry import rater
+LIMIT = 3
+runs = []
+runs.append(1)
+
+@rater("gentle")
+def gentle(segments):
+    return segments
+
+class Strict:
+    pass
+
+def brisk(segments):
+    return segments
+"""
+
+
+@pytest.fixture(autouse=True)
+def clean_registry(monkeypatch):
+    """Each test sees what is registered now, and leaves nothing behind."""
+    kept = {kind: dict(found) for kind, found in registry._registered.items()}
+    monkeypatch.setattr(registry, "_registered", kept)
+    before = set(sys.modules)
+    yield
+    for name in set(sys.modules) - before:
+        if name.startswith("popl_rl_file_"):
+            del sys.modules[name]
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "my_raters.py"
+    path.write_text(GOOD)
+    return path
+
+
+def test_a_decorated_function_is_unchanged_and_found_by_name():
+    def quick(segments):
+        return segments
+
+    assert rater("quick")(quick) is quick
+    assert resolve("rater", "quick") is quick
+    assert "quick" in names("rater")
+
+
+def test_kinds_have_names_of_their_own():
+    def shared():
+        return None
+
+    rater("shared")(shared)
+    with pytest.raises(ValueError, match="unknown env 'shared'"):
+        resolve("env", "shared")
+
+
+def test_built_ins_are_found_through_entry_points():
+    assert "two_doors" in names("env")
+    assert {"upper", "lower", "third", "fourth"} <= set(names("rater"))
+    assert resolve("env", "two_doors").__module__ == "popl_rl.envs.two_doors"
+    assert names("rater") == sorted(names("rater"))
+
+
+def test_a_taken_name_is_an_error():
+    @rater("mine")
+    def first(segments):
+        return segments
+
+    def second(segments):
+        return segments
+
+    with pytest.raises(ValueError, match=r"'mine' is taken by .*first in .*choose another"):
+        rater("mine")(second)
+
+
+def test_a_name_of_an_installed_package_is_taken_before_it_is_loaded(monkeypatch):
+    monkeypatch.setitem(registry._registered, "rater", {})
+
+    with pytest.raises(ValueError, match="'upper' is taken by upper in .*two_doors.py"):
+
+        @rater("upper")
+        def other(segments):
+            return segments
+
+
+def test_a_reload_may_register_again():
+    def define():
+        @rater("again")
+        def again(segments):
+            return segments
+
+        return again
+
+    define()
+    newer = define()
+    assert resolve("rater", "again") is newer
+
+
+def test_module_and_attribute():
+    assert resolve("rater", "popl_rl.envs.two_doors:lower") is resolve("rater", "lower")
+
+
+def test_file_and_attribute(file, monkeypatch):
+    brisk = resolve("rater", "my_raters.py:brisk")
+    assert brisk(3) == 3
+    assert resolve("rater", f"{file}:brisk") is brisk
+    assert resolve("rater", "gentle") is resolve("rater", "my_raters.py:gentle")
+    assert sys.modules[brisk.__module__].runs == [1]
+    assert pickle.loads(pickle.dumps(brisk)) is brisk
+
+
+def test_two_files_of_one_name_are_two_modules(file, tmp_path):
+    other = tmp_path / "sub" / "my_raters.py"
+    other.parent.mkdir()
+    other.write_text("def brisk(segments):\n    return -1\n")
+    assert resolve("rater", "sub/my_raters.py:brisk")(0) == -1
+    assert resolve("rater", "my_raters.py:brisk")(0) == 0
+
+
+def test_an_unknown_name_answers_with_the_nearest_the_list_and_the_forms():
+    with pytest.raises(ValueError, match=r"unknown rater 'uper'") as caught:
+        resolve("rater", "uper")
+    message = str(caught.value)
+    assert "Did you mean 'upper'?" in message
+    assert "fourth, " in message
+    for form in ("registered name", "package.module:attr", "path/file.py:attr"):
+        assert form in message
+
+
+def test_a_missing_attribute_lists_what_there_is(file):
+    with pytest.raises(ValueError, match=r"no 'brsk'. Did you mean 'brisk'\?") as caught:
+        resolve("rater", "my_raters.py:brsk")
+    assert "It defines: Strict, brisk, gentle." in str(caught.value)
+
+
+def test_a_missing_file_lists_its_folder(file):
+    with pytest.raises(ValueError, match=r"no Python file .*raters\.py\..*: my_raters\.py\."):
+        resolve("rater", "raters.py:gentle")
+    with pytest.raises(ValueError, match=r"no Python file .*Python files in that folder: none"):
+        resolve("rater", "nowhere/raters.py:gentle")
+
+
+def test_an_error_in_a_file_is_wrapped_and_the_file_can_be_mended(file):
+    file.write_text("import json\njson.loads('{')\n")
+    with pytest.raises(ValueError, match=r"my_raters.py:gentle'.*JSONDecodeError") as caught:
+        resolve("rater", "my_raters.py:gentle")
+    assert caught.value.__cause__ is not None
+    file.write_text(GOOD)
+    assert resolve("rater", "my_raters.py:gentle")(1) == 1
+
+
+def test_a_syntax_error_is_wrapped(file):
+    file.write_text("def gentle(:\n")
+    with pytest.raises(ValueError, match="SyntaxError"):
+        resolve("rater", "my_raters.py:gentle")
+
+
+def test_a_missing_module_suggests_the_file():
+    with pytest.raises(ValueError, match=r"Is it installed, .*'no/such_one\.py:\.\.\.'"):
+        resolve("rater", "no.such_one:gentle")
+
+
+def test_a_module_that_misses_another_is_not_called_missing(file, monkeypatch):
+    monkeypatch.syspath_prepend(str(file.parent))
+    (file.parent / "needs_more.py").write_text("import not_there_at_all\n")
+    with pytest.raises(ValueError, match="No module named 'not_there_at_all'") as caught:
+        resolve("rater", "needs_more:gentle")
+    assert "Is it installed" not in str(caught.value)
+
+
+@pytest.mark.parametrize("reference", ["my_raters.py:", ":gentle"])
+def test_incomplete_references(file, reference):
+    with pytest.raises(ValueError, match="is incomplete. A reference is"):
+        resolve("rater", reference)
+
+
+def test_a_file_without_attribute_says_what_to_add(file):
+    with pytest.raises(ValueError, match="names a file: add ':'"):
+        resolve("rater", "my_raters.py")
+
+
+def test_what_is_found_must_be_callable(file):
+    with pytest.raises(TypeError, match=r"must name a function or class, got a int"):
+        resolve("rater", "my_raters.py:LIMIT")
+
+
+@pytest.mark.parametrize("name", ["", "a:b", None])
+def test_names_are_checked(name):
+    with pytest.raises(ValueError, match="@env needs a name without ':'"):
+        env(name)
+
+
+def test_a_forgotten_name_is_reported():
+    with pytest.raises(ValueError, match=r"@rater needs a name.*@rater\('my_rater'\)"):
+
+        @rater
+        def gentle(segments):
+            return segments
+
+
+def test_kind_and_type_of_a_reference_are_checked():
+    with pytest.raises(ValueError, match=r"kind must be one of \['behaviour', 'env', 'rater'\]"):
+        resolve("robot", "x")
+    with pytest.raises(TypeError, match="must be a string, got int"):
+        resolve("env", 3)
+
+
+def test_two_packages_may_not_declare_one_name(monkeypatch):
+    points = [EntryPoint("twin", f"package_{side}:twin", "popl_rl.env") for side in "ab"]
+    monkeypatch.setattr(registry, "entry_points", lambda group: points)
+    registry._entry_points.cache_clear()
+    with pytest.raises(ValueError, match=r"'twin' is declared by two installed packages"):
+        names("env")
+    registry._entry_points.cache_clear()
