@@ -32,6 +32,7 @@ class Step(NamedTuple):
 
 
 def call(name: str, doing: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    """Call what the author wrote; what that raises becomes the cause of a ValueError."""
     try:
         return function(*args, **kwargs)
     except Exception as error:
@@ -40,11 +41,12 @@ def call(name: str, doing: str, function: Callable[..., Any], *args: Any, **kwar
 
 
 def check_spaces(name: str, env: Env) -> None:
+    """Check that spaces are of the kinds that policies are built for."""
     seen, acts = env.observation_space, env.action_space
     if not isinstance(seen, gymnasium.spaces.Box) or len(seen.shape) != 1:
         raise TypeError(
-            f"env {name!r}: observation_space must be a Box with one dimension, got {seen}; wrap it "
-            "in gymnasium.wrappers.FlattenObservation."
+            f"env {name!r}: observation_space must be a Box with one dimension, got {seen}; wrap "
+            "it in gymnasium.wrappers.FlattenObservation."
         )
     if seen.dtype != np.float32:
         raise TypeError(
@@ -81,7 +83,8 @@ def random_steps(name: str, env: Env, num_steps: int, seed: int) -> list[Step]:
             first_reset = False
             if not isinstance(answer, tuple) or len(answer) != 2:
                 raise TypeError(
-                    f"env {name!r}: reset must return (observation, info), got {_described(answer)}."
+                    f"env {name!r}: reset must return (observation, info), got "
+                    f"{_described(answer)}."
                 )
             action, (observation, info), reward, terminated, over = None, answer, 0.0, False, False
         else:
@@ -132,7 +135,8 @@ def _check_observation(name: str, env: Env, observation: Any) -> None:
 def _check_outcome(name: str, reward: Any, terminated: Any, truncated: Any) -> None:
     if not isinstance(reward, (int, float, np.integer, np.floating)):
         raise TypeError(
-            f"env {name!r}: the reward must be a number, got a {type(reward).__name__}; use float()."
+            f"env {name!r}: the reward must be a number, got a {type(reward).__name__}; use "
+            "float()."
         )
     if not np.isfinite(reward):
         raise ValueError(f"env {name!r}: the reward must be finite, got {reward}.")
@@ -162,6 +166,7 @@ def _check_info(name: str, info: Any, first: dict[str, float] | None) -> None:
 
 
 def check_repeats(name: str, first: list[Step], second: list[Step]) -> None:
+    """Check that two runs from one seed are equal."""
     for one, other in zip(first, second, strict=True):
         if not (
             np.array_equal(one.observation, other.observation)
@@ -234,21 +239,19 @@ def check_behaviours(name: str, found: Any) -> None:
     """Check that behaviours are functions or tables of probabilities."""
     if not isinstance(found, dict) or not found:
         raise TypeError(
-            f"env {name!r}: behaviours() must return a dict of name to probabilities, got "
+            f"env {name!r}: behaviours() must return a dict of at least one name, got "
             f"{found if found == {} else type(found).__name__}."
         )
     for label, policy in found.items():
+        if callable(policy):
+            continue
         if not isinstance(policy, Tensor) or not policy.is_floating_point() or policy.ndim != 2:
-            # Other environments may hand out functions; only tables can be checked here.
-            if callable(policy):
-                continue
             raise TypeError(
-                f"env {name!r}: behaviour {label!r} must be float [states, actions] or a function, "
-                f"got {type(policy).__name__}."
+                f"env {name!r}: behaviour {label!r} must be a float tensor [states, actions] or a "
+                f"function, got {getattr(policy, 'dtype', type(policy).__name__)}."
             )
-        if not bool((policy >= 0).all()) or not torch.allclose(
-            policy.sum(1), policy.new_ones(len(policy)), atol=1e-4
-        ):
+        total = policy.sum(1)
+        if not bool((policy >= 0).all()) or not torch.allclose(total, torch.ones_like(total)):
             raise ValueError(
                 f"env {name!r}: each row of behaviour {label!r} must be probabilities that sum to "
                 "1; use softmax(-1)."
@@ -256,10 +259,13 @@ def check_behaviours(name: str, found: Any) -> None:
 
 
 def check_torchrl(name: str, env: Env) -> None:
+    """Check that TorchRL can wrap the environment."""
     level = logger.level
     logger.setLevel("ERROR")
     try:
-        check_env_specs(GymWrapper(env, categorical_action_encoding=True))
+        # The check seeds torch's own generator.
+        with torch.random.fork_rng(devices=[]):
+            check_env_specs(GymWrapper(env, categorical_action_encoding=True))
     except Exception as error:
         raise ValueError(
             f"env {name!r}: TorchRL's check_env_specs failed with {type(error).__name__}: "

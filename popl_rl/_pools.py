@@ -13,6 +13,7 @@ BLOCK_NS = 200_000  # the fixed cost of one block of draws
 SETTLE_NS = 150_000  # the fixed cost of settling one selection
 
 
+
 class Epsilon:
     """Tolerance per case: given, or the median absolute deviation, worked out where it is needed.
 
@@ -65,16 +66,16 @@ class PassPools:
         self.scores = passes.view(torch.uint8)
         self.packed = _pack(self.scores)  # [member / 8, case]
         self.cases = (self.packed.amax(0) > 0).logical_and_(self.packed.amin(0) < 255).nonzero()[:, 0]
-        # A case halves a pool at best, so that many it takes, and a few more for the unlucky.
-        self.block = (len(passes) - 1).bit_length() + 6
+        # Cases that half the members pass leave one in a thousand pools undecided after this many.
+        self.block = (len(passes) - 1).bit_length() + 5
         self.chunk = max(1, 2**24 // (self.block * len(self.packed)))
-        self.ones = torch.tensor([byte.bit_count() for byte in range(256)], device=passes.device)
+        bits = torch.arange(8, device=passes.device)
+        self.set_bits = (torch.arange(256, device=passes.device)[:, None] >> bits) & 1
 
     def open(self, num_selections: int) -> None:
         """Start this many selections, each with every member in its pool."""
-        bits = torch.full_like(self.packed[:, :1], 255)
-        bits[-1] >>= -len(self.scores) % 8
-        self.bits = bits.repeat(1, num_selections)  # [member / 8, selection]
+        self.bits = self.packed.new_full((len(self.packed), num_selections), 255)
+        self.bits[-1] >>= -len(self.scores) % 8  # no bit stands for no member
 
     def narrow(self, cases: Tensor, closed: Tensor | None) -> tuple[Tensor, float]:
         """Filter each pool by its cases in turn.
@@ -97,12 +98,12 @@ class PassPools:
                 spared |= closed[step]
             self.bits = kept.bitwise_or_(self.bits * spared)
             history.append(self.bits)
-        narrowed = torch.stack(history).diff(dim=0).amax(1) > 0
+        narrowed = torch.stack(history, 1).diff(dim=1).amax(0) > 0
         return narrowed, BLOCK_NS + passed.numel()
 
     def sizes(self) -> Tensor:
         """Members left in each pool, ``[selection]``."""
-        return self.ones[self.bits.long()].sum(0)
+        return self.set_bits.sum(1).take(self.bits.long()).sum(0)
 
     def keep(self, selections: Tensor) -> None:
         """Go on with the selections at these indices only."""
@@ -110,11 +111,10 @@ class PassPools:
 
     def members(self, selections: Tensor) -> tuple[Tensor, Tensor]:
         """Who is in these pools, as pairs: (position in ``selections``, member), ``[pair]`` each."""
-        bits = self.bits[:, selections]
+        bits = self.bits.index_select(1, selections)
         byte, owner = bits.nonzero().unbind(1)
-        shifts = torch.arange(8, dtype=torch.uint8, device=bits.device)
-        pair, bit = ((bits[byte, owner][:, None] >> shifts) & 1).nonzero().unbind(1)
-        return owner[pair], 8 * byte[pair] + bit
+        pair, bit = self.set_bits[bits[byte, owner].long()].nonzero().unbind(1)
+        return owner.take(pair), 8 * byte.take(pair) + bit
 
 
 def _pack(flags: Tensor) -> Tensor:
@@ -145,10 +145,10 @@ class ScorePools:
 
     block = 2
 
-    def __init__(self, scores: Tensor, epsilon: Epsilon | None, cases: Tensor) -> None:
+    def __init__(self, scores: Tensor, epsilon: Epsilon | None) -> None:
         self.scores = scores.contiguous()
         self.epsilon = epsilon
-        self.cases = cases
+        self.cases = (scores.amin(0) < scores.amax(0)).nonzero()[:, 0]
         self.chunk = max(1, 2**22 // len(scores))
         floating = scores.dtype.is_floating_point
         self.lowest = -torch.inf if floating else torch.iinfo(scores.dtype).min
@@ -229,7 +229,7 @@ class Round:
         self.generator = generator
         self.device = weights.device
         self.num_cases = pools.scores.shape[1]
-        self.splitting: dict[tuple[int, ...], Tensor] = {}
+        self.known: dict[tuple[int, ...], Tensor] = {}
 
     def select(self, num_selected: int) -> tuple[Tensor, Tensor]:
         """Select behaviours.
@@ -238,7 +238,7 @@ class Round:
             The behaviour chosen by each selection, and the place in its order of the last case
             that removed a member (0 if none did), ``[num_selected]`` each.
         """
-        self.depth = torch.zeros(num_selected, dtype=torch.long, device=self.device)
+        self.depth = self.weights.new_zeros(num_selected)
         self.ended: list[tuple[Tensor, Tensor]] = []  # (selection, behaviour) pairs
         selections = torch.arange(num_selected, device=self.device)
         if len(self.pools.cases):
@@ -246,50 +246,56 @@ class Round:
                 self._run(part)
         else:
             everyone = torch.arange(len(self.weights), device=self.device)
-            self.ended = [(selections.repeat_interleave(len(everyone)), everyone.repeat(num_selected))]
-        return self._choose(), self.depth
+            owner = selections.repeat_interleave(len(everyone))
+            self.ended.append((owner, everyone.repeat(num_selected)))
+        return self._choose(num_selected), self.depth
 
     def _run(self, selections: Tensor) -> None:
         pools, cases = self.pools, self.pools.cases
         pools.open(len(selections))
         looked = torch.zeros_like(selections)  # length of the order so far
-        skipped = torch.zeros_like(selections)  # how much of it splits no pool at all
+        skipped = looked  # how much of it is cases on which all members agree
+        depth = looked
         drawn = selections.new_empty(0, len(selections))
         spent, landmark = 0.0, torch.inf
-        while len(selections):
+        while True:
             shape = (pools.block, len(selections))
             draws = torch.randint(len(cases), shape, generator=self.generator, device=self.device)
             drawn = torch.cat([drawn, draws])
             places, skipped = self._places(drawn, draws, looked, skipped)
             looked = places[-1]
             closed = places > self.limit if self.limit < self.num_cases else None
-            narrowed, work = pools.narrow(cases[draws], closed)
-            last = (places * narrowed).amax(0)
-            self.depth[selections] = torch.where(last > 0, last, self.depth[selections])
+            narrowed, work = pools.narrow(cases.take(draws), closed)
+            depth = torch.maximum(depth, (places * narrowed).amax(0))
 
             sizes = pools.sizes()
-            done = (sizes == 1) | (looked >= self.limit)
-            over, left = done.nonzero()[:, 0], (~done).nonzero()[:, 0]
+            done = (sizes == 1).logical_or_(looked >= self.limit)
+            over = done.nonzero().view(-1)
             if len(over):
                 owner, member = pools.members(over)
-                self.ended.append((selections[over][owner], member))
+                ended = selections.take(over)
+                self.ended.append((ended.take(owner), member))
+                self.depth[ended] = depth.take(over)
+                if len(over) == len(selections):
+                    return
+                left = (~done).nonzero().view(-1)
                 pools.keep(left)
-                selections, looked, skipped = selections[left], looked[left], skipped[left]
-                drawn = drawn[:, left]
+                selections, depth, sizes = selections[left], depth[left], sizes[left]
+                looked, skipped, drawn = looked[left], skipped[left], drawn[:, left]
 
             # Draw on while the pools shrink. When they stop, go on only until the draws have cost
             # as much as settling would: then the total is never far from the cheaper of the two.
-            pairs = int(sizes.sum()) - len(over)
+            pairs = int(sizes.sum())
             spent += work
             if pairs <= landmark / 2:
                 spent, landmark = 0.0, pairs
             elif spent >= self._settling_work(len(selections), pairs):
                 break
-        if len(selections):
-            owner, member = pools.members(torch.arange(len(selections), device=self.device))
-            members = member[owner.argsort(stable=True)].split(pools.sizes().tolist())
-            for selection, place, pool in zip(selections, looked.tolist(), members, strict=True):
-                self._settle(selection, place, pool)
+        owner, member = pools.members(torch.arange(len(selections), device=self.device))
+        members = member[owner.argsort(stable=True)].split(sizes.tolist())
+        self.depth[selections] = depth
+        for selection, place, pool in zip(selections, looked.tolist(), members, strict=True):
+            self._settle(selection, place, pool)
 
     def _places(
         self, drawn: Tensor, draws: Tensor, looked: Tensor, skipped: Tensor
@@ -301,7 +307,8 @@ class Round:
         """
         earlier = draws.new_ones(len(draws), len(drawn), dtype=torch.bool)
         earlier = earlier.tril(len(drawn) - len(draws) - 1)
-        fresh = ~((drawn == draws[:, None]) & earlier[:, :, None]).any(1)
+        again = (drawn == draws[:, None]).logical_and_(earlier[:, :, None])
+        fresh = again.view(torch.uint8).amax(1).logical_not_()  # far faster than any() of bools
         aside = self.num_cases - len(self.pools.cases)
         if not aside:
             return looked + fresh.cumsum(0), skipped
@@ -319,10 +326,7 @@ class Round:
 
         Give each case a uniform time of arrival; the first of n arrives at 1 - U ** (1 / n).
         """
-        chance = torch.rand(
-            wanted.shape, generator=self.generator, device=self.device, dtype=torch.float64
-        )
-        first = 1 - chance ** (1 / wanted)
+        first = 1 - self._uniform(*wanted.shape) ** (1 / wanted)
         return torch.binomial(others.double(), first, generator=self.generator).long()
 
     def _settling_work(self, num_selections: int, pairs: int) -> float:
@@ -334,22 +338,15 @@ class Round:
     def _settle(self, selection: Tensor, looked: int, pool: Tensor) -> None:
         """Finish one selection by drawing only cases that split its pool.
 
-        None of them has been in the order yet: what a case has kept, it keeps.
+        None of them has been in the order yet: whom a case has kept, it would keep again.
         """
         scores, epsilon = self.pools.scores, self.pools.epsilon
         while True:
-            key = tuple(pool.tolist())
-            if key not in self.splitting:
-                rows = scores[pool]
-                bar = rows.amax(0)
-                if epsilon is not None:
-                    bar = bar - epsilon.at(torch.arange(self.num_cases, device=self.device))
-                self.splitting[key] = (rows.amin(0) < bar).nonzero()[:, 0]
-            cases = self.splitting[key]
+            cases = self._splitting(pool)
             if not len(cases):
                 break
-            wanted = looked_at = torch.tensor(len(cases), device=self.device)
-            looked += 1 + int(self._gap(wanted, self.num_cases - looked - looked_at))
+            counts = torch.tensor([len(cases), self.num_cases - looked - len(cases)])
+            looked += 1 + int(self._gap(*counts.to(self.device)))
             if looked > self.limit:
                 break
             self.depth[selection] = looked
@@ -360,17 +357,35 @@ class Round:
             pool = pool[values >= bar]
         self.ended.append((selection.expand(len(pool)), pool))
 
-    def _choose(self) -> Tensor:
+    def _splitting(self, pool: Tensor) -> Tensor:
+        """Cases that would remove someone from this pool."""
+        key = tuple(pool.tolist())
+        if key in self.known:
+            return self.known[key]
+        rows = self.pools.scores[pool]
+        bar = rows.amax(0)
+        if self.pools.epsilon is not None:
+            bar -= self.pools.epsilon.at(torch.arange(self.num_cases, device=self.device))
+        cases = (rows.amin(0) < bar).nonzero().view(-1)
+        if len(self.known) < 2**24 // self.num_cases:  # selections often end in the same few pools
+            self.known[key] = cases
+        return cases
+
+    def _choose(self, num_selected: int) -> Tensor:
         """Draw one behaviour of the pool each selection ended with, by the members behind it."""
         owner = torch.cat([owner for owner, _ in self.ended])
         member = torch.cat([member for _, member in self.ended])
+        if len(member) == num_selected:  # nothing to draw: each pool is down to one
+            return torch.empty_like(member).scatter_(0, owner, member)
         order = owner.argsort(stable=True)
         member = member[order]
         mass = self.weights[member].cumsum(0)
         end = mass[owner.bincount().cumsum(0) - 1]
         start = torch.cat([end.new_zeros(1), end[:-1]])
-        chance = torch.rand(
-            len(end), generator=self.generator, device=self.device, dtype=torch.float64
-        )
-        ticket = start + (chance * (end - start)).long()
+        ticket = start + (self._uniform(num_selected) * (end - start)).long()
         return member[torch.searchsorted(mass, ticket, right=True)]
+
+    def _uniform(self, *shape: int) -> Tensor:
+        return torch.rand(
+            shape, generator=self.generator, device=self.device, dtype=torch.float64
+        )

@@ -22,6 +22,7 @@ __all__ = [
     "new_rater_answers",
     "recovery",
     "roll_out",
+    "success_rate",
 ]
 
 
@@ -104,9 +105,12 @@ def success_rate(episodes: TensorDictBase, key: str) -> Tensor:
     return ((episodes[INFO, key] > 0) & episodes[MASK]).any(-1).float().mean(-1)
 
 
-def recovery(value: Tensor, *, random: Tensor, oracle: Tensor) -> Tensor:
-    """``(return - random) / (oracle - random)``: 1 is the oracle's, 0 a random policy's return."""
-    return (value - random) / (oracle - random)
+def recovery(value: float, *, random: float, oracle: float) -> float:
+    """``(value - random) / (oracle - random)``: 1 is the oracle's return, 0 a random policy's.
+
+    NaN where the oracle is no better than random, since then nothing was there to recover.
+    """
+    return (value - random) / (oracle - random) if oracle > random else float("nan")
 
 
 def held_out_pairs(

@@ -47,6 +47,9 @@ class PolicySet:
         alpha: Scale of their scores, as trained.
         discount: Per-step discount of their scores.
 
+    Attributes:
+        origin: Member of the trained population that each policy was.
+
     Example:
         >>> policies = PolicySet.load("runs/mine/policies")  # doctest: +SKIP
         >>> choice = policies.cater(segments, answers)  # doctest: +SKIP
@@ -59,6 +62,7 @@ class PolicySet:
         self.population = population
         self.alpha = alpha
         self.discount = discount
+        self.origin = list(range(len(population)))
 
     @classmethod
     def distinct(
@@ -74,7 +78,9 @@ class PolicySet:
         passes = margins(population, bank, comparisons, alpha=alpha, discount=discount) > 0
         inverse = passes.unique(dim=0, return_inverse=True)[1].tolist()
         first = sorted({behaviour: inverse.index(behaviour) for behaviour in inverse}.values())
-        return cls(population.subset(first), alpha=alpha, discount=discount)
+        policies = cls(population.subset(first), alpha=alpha, discount=discount)
+        policies.origin = first
+        return policies
 
     def __len__(self) -> int:
         return len(self.population)
@@ -90,9 +96,18 @@ class PolicySet:
         similarity = (sign @ sign.T / sign.shape[1]).clamp(min=0)
         return float(1 / similarity.mean())
 
-    def _margins(self, bank: SegmentBank, comparisons: Comparisons) -> Tensor:
+    def _margins(
+        self, segments: TensorDictBase | SegmentBank, comparisons: Comparisons
+    ) -> Tensor:
+        known = isinstance(segments, SegmentBank)
+        bank = segments if known else SegmentBank.from_segments(segments)
+        device = self.population.device
         return margins(
-            self.population, bank, comparisons, alpha=self.alpha, discount=self.discount
+            self.population,
+            bank.to(device),
+            comparisons.to(device),
+            alpha=self.alpha,
+            discount=self.discount,
         )
 
     @torch.no_grad()
@@ -168,13 +183,8 @@ class PolicySet:
         Raises:
             ValueError: If no answer is strict, or the arguments are off.
         """
-        bank = (
-            segments
-            if isinstance(segments, SegmentBank)
-            else SegmentBank.from_segments(segments)
-        )
         comparisons = Comparisons.from_preferences(answers, cases="preference")
-        margin = self._margins(bank, comparisons)
+        margin = self._margins(segments, comparisons).cpu()
         if method == "posterior":
             if not 0 <= mistake < 0.5:
                 raise ValueError(f"mistake must be in [0, 0.5), got {mistake}")
@@ -208,13 +218,8 @@ class PolicySet:
         """
         if not 0 <= quantile <= 1:
             raise ValueError(f"quantile must be in [0, 1], got {quantile}")
-        bank = (
-            segments
-            if isinstance(segments, SegmentBank)
-            else SegmentBank.from_segments(segments)
-        )
         comparisons = Comparisons.from_preferences(answers, cases="rater")
-        values = case_values(self._margins(bank, comparisons) > 0, comparisons)
+        values = case_values(self._margins(segments, comparisons).cpu() > 0, comparisons)
         return int(values.quantile(quantile, dim=1).argmax())
 
     def save(self, path: Path | str) -> None:

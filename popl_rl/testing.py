@@ -1,8 +1,12 @@
 """Checks for people who write environments and raters, and a tiny environment to try things on.
 
-From a shell, ``python -m popl_rl.testing env two_doors --with doors=3`` or ``python -m popl_rl.testing
-rater my_raters.py:gentle --env two_doors``: one line says what is wrong and what to do, with exit
-code 2, or that nothing is, with exit code 0. Importing this module registers nothing.
+From a shell::
+
+    python -m popl_rl.testing env two_doors --with doors=3
+    python -m popl_rl.testing rater my_raters.py:gentle --env two_doors
+
+One line says what is wrong and what to do, with exit code 2, or that nothing is, with exit code 0.
+Importing this module registers nothing.
 """
 
 import argparse
@@ -79,7 +83,7 @@ def check_env(env: EnvReference, *, num_steps: int = 200, seed: int = 0, **argum
 def check_rater(
     rater: str | Utility, env: EnvReference | None = None, *, seed: int = 0, **arguments: Any
 ) -> None:
-    """Check that a rater's function can be used with an environment; the first fault found is raised.
+    """Check that a rater's function fits an environment; the first fault found is raised.
 
     Args:
         rater: A function from segments ``[B, T]`` to utilities ``[B, T]``, or a reference to one.

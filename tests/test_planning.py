@@ -1,7 +1,8 @@
 """Planning on a chain of three states, worked by hand.
 
-States 0, 1, 2; action 0 stays, action 1 goes on; going on from 2 ends the episode. Staying is worth 0, going on -1 from 0 and
-1, and 10 from 2. With discount 0.5: V(2) = 10, V(1) = -1 + 5 = 4, V(0) = -1 + 2 = 1.
+States 0, 1, 2; action 0 stays, action 1 goes on; going on from 2 ends the episode. Staying is worth
+0, going on -1 from 0 and 1, and 10 from 2. With discount 0.5: V(2) = 10, V(1) = -1 + 5 = 4,
+V(0) = -1 + 2 = 1.
 """
 
 import dataclasses
@@ -77,8 +78,10 @@ def test_maximum_entropy_that_goes_on_by_hand():
 
 
 def test_return_by_hand(chain):
-    """Staying with probability 1/2: expected worth -1/2 in step 1; in step 2, -1/2 whether in 0 or 1; in step 3, one
-    quarter is still in 0 and one half in 1 (-3/8 together), one quarter in 2 (10/8)."""
+    """Staying half the time is worth -1/2 in steps 1 and 2, in which the walker is in 0 or 1.
+
+    Before step 3 a quarter is in 0, half in 1 (-3/8 together) and a quarter in 2 (10/8).
+    """
     half = torch.full((3, 2), 0.5)
     assert policy_return(chain, half, REWARD, horizon=1) == pytest.approx(-0.5)
     assert policy_return(chain, half, REWARD, horizon=2) == pytest.approx(-1.0)
@@ -126,7 +129,7 @@ def test_values_satisfy_the_bellman_equation(seed, temperature):
 
 
 def test_values_that_grow_without_end_are_an_error(chain):
-    with pytest.raises(ValueError, match="did not converge.*smaller discount"):
+    with pytest.raises(ValueError, match=r"did not converge.*smaller discount"):
         solve(chain, torch.ones(3, 2), discount=1.0)
 
 

@@ -42,7 +42,7 @@ def segments():
 
 @pytest.fixture
 def table():
-    """Action 1 goes from state 0 to 1 for reward 1; in state 1 both actions end, action 1 for reward 2."""
+    """Action 1 leads from state 0 to 1 for 1; in state 1 both actions end, action 1 for 2."""
     steps = TensorDict(
         {
             "observation": torch.zeros(2, 2, 1),
@@ -90,13 +90,16 @@ def test_shares_of_answers_are_those_of_the_model(response, gap, probability, ge
     number = 20_000
     sums = torch.tensor([[0.5, 0.5 + gap]]).repeat(number, 1)
     share = (response.answer(sums, generator) == SECOND).double().mean().item()
-    assert share == pytest.approx(probability, abs=4 * math.sqrt(probability * (1 - probability) / number))
+    error = math.sqrt(probability * (1 - probability) / number)
+    assert share == pytest.approx(probability, abs=4 * error)
 
 
 @settings(max_examples=30, deadline=None)
 @given(
     st.integers(0, 10_000),
-    st.sampled_from([Response(), Response(tie=0.5), Response(skip=0.0), Response(tie=0.3, skip=-0.2)]),
+    st.sampled_from(
+        [Response(), Response(tie=0.5), Response(skip=0.0), Response(tie=0.3, skip=-0.2)]
+    ),
 )
 def test_swapping_the_segments_mirrors_a_greedy_answer(seed, response):
     generator = torch.Generator().manual_seed(seed)
@@ -152,7 +155,7 @@ def test_worth_by_return_is_the_myopic_sum(segments):
 
 
 def test_worth_by_regret_is_the_sum_of_advantages(segments, table):
-    """With discount 0.5: V(1) = 2, V(0) = 1 + 1 = 2, so A(0, 0) = 1 - 2 = -1 and A(1, 0) = -2, the rest are best."""
+    """With discount 0.5: V(1) = 2, V(0) = 1 + 1 = 2, so A(0, 0) = 1 - 2 and A(1, 0) = 0 - 2."""
     (group,) = make_groups([by_reward], table=table, discount=0.5)
     assert group.advantages is not None
     torch.testing.assert_close(
@@ -218,7 +221,7 @@ def test_bad_groups(references, options, error, message):
 
 
 def test_a_label_and_advantages_go_together():
-    with pytest.raises(ValueError, match="needs advantages .* with no advantages"):
+    with pytest.raises(ValueError, match=r"needs advantages .* with no advantages"):
         RaterGroup("her", by_reward, Response(), "regret")
     with pytest.raises(ValueError, match="and label='return' none"):
         RaterGroup("her", by_reward, Response(), "return", torch.zeros(2, 2))
@@ -327,12 +330,12 @@ def test_bad_raters(groups):
 
 
 def test_each_rater_answers_for_their_group(groups, segments, generator):
-    raters = Raters(groups, torch.tensor([0, 1, 0]))
+    raters = Raters(groups, torch.tensor([1, 0, 0]))
     worth = raters.worth(segments)
     assert worth.tolist() == [[6.0, 6.0, 5.0], [-6.0, -6.0, -5.0]]
     pairs = torch.tensor([[0, 2], [0, 2], [2, 0], [0, 1], [0, 1]])
     answers = raters.answer(pairs, torch.tensor([0, 1, 2, 0, 1]), worth, generator)
-    assert answers.tolist() == [FIRST, SECOND, SECOND, TIE, TIE]
+    assert answers.tolist() == [SECOND, FIRST, SECOND, TIE, TIE]
     assert answers.dtype == torch.int64
 
 
@@ -350,7 +353,7 @@ def test_each_group_answers_in_its_own_way(segments, generator):
     [
         (torch.zeros(4), torch.zeros(4), torch.zeros(2, 3), r"pairs must have shape \[pairs, 2\]"),
         (torch.zeros(4, 2), torch.zeros(3), torch.zeros(2, 3), r"rater must have shape \[4\]"),
-        (torch.zeros(4, 2), torch.zeros(4), torch.zeros(3, 2), r"\[2 groups, segments\], got \[3, 2\]"),
+        (torch.zeros(4, 2), torch.zeros(4), torch.zeros(3, 2), r"\[2 groups, .*got \[3, 2\]"),
     ],
 )
 def test_bad_questions(groups, generator, pairs, rater, worth, message):

@@ -85,7 +85,7 @@ def test_a_taken_name_is_an_error():
 def test_a_name_of_an_installed_package_is_taken_before_it_is_loaded(monkeypatch):
     monkeypatch.setitem(registry._registered, "rater", {})
 
-    with pytest.raises(ValueError, match="'upper' is taken by upper in .*two_doors.py"):
+    with pytest.raises(ValueError, match=r"'upper' is taken by upper in .*two_doors.py"):
 
         @rater("upper")
         def other(segments):
@@ -179,7 +179,7 @@ def test_a_module_that_misses_another_is_not_called_missing(file, monkeypatch):
 
 @pytest.mark.parametrize("reference", ["my_raters.py:", ":gentle"])
 def test_incomplete_references(file, reference):
-    with pytest.raises(ValueError, match="is incomplete. A reference is"):
+    with pytest.raises(ValueError, match=r"is incomplete\. A reference is"):
         resolve("rater", reference)
 
 
@@ -216,7 +216,7 @@ def test_kind_and_type_of_a_reference_are_checked():
 
 def test_two_packages_may_not_declare_one_name(monkeypatch):
     points = [EntryPoint("twin", f"package_{side}:twin", "popl_rl.env") for side in "ab"]
-    monkeypatch.setattr(registry, "entry_points", lambda group: points)
+    monkeypatch.setattr(registry, "entry_points", lambda **_: points)
     registry._entry_points.cache_clear()
     with pytest.raises(ValueError, match=r"'twin' is declared by two installed packages"):
         names("env")

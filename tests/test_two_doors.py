@@ -198,7 +198,7 @@ def best_policy(group):
 
 
 def through(env, door):
-    """What share of episodes of a policy goes through a door: the return of a utility of one per door."""
+    """Return the table and a utility whose return is the share of episodes through a door."""
     table = env.transition_table()
     return table, (table.steps["info", "door"] == door).double()
 

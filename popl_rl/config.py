@@ -1,0 +1,236 @@
+"""Schemas of the configuration, with defaults and what they mean, and one check of it all."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from omegaconf import MISSING
+
+__all__ = [
+    "Config",
+    "DataConfig",
+    "EnvConfig",
+    "EvaluateConfig",
+    "EvaluationConfig",
+    "LoggerConfig",
+    "MethodConfig",
+    "RatersConfig",
+    "ResponseConfig",
+    "validate",
+]
+
+
+@dataclass
+class EnvConfig:
+    """Which environment, and how long an episode may be."""
+
+    factory: str = "two_doors"  # registered name, module:attr or file.py:attr
+    options: dict[str, Any] = field(default_factory=dict)  # arguments of the factory
+    data_options: dict[str, Any] = field(default_factory=dict)  # on top of these, for data only
+    id: str | None = None  # id of a Gymnasium environment, for env=gym
+    max_steps: int = 60  # steps after which an episode is cut
+    success: str = "goal"  # number in info that is positive when the task is done
+    door: str | None = None  # integer in info whose values are worth a row in the table
+
+
+@dataclass
+class ResponseConfig:
+    """How raters answer: B-Pref's model (Lee et al., 2021), the same for all groups."""
+
+    rationality: float = float("inf")  # beta of the Bernoulli answer; inf always tells the truth
+    mistake: float = 0.0  # chance that an answer is flipped
+    myopia: float = 1.0  # gamma; below 1 the end of a segment weighs more
+    tie: float = 0.0  # differences up to this are ties
+    skip: float | None = None  # pairs in which both are worth no more than this are skipped
+
+
+@dataclass
+class RatersConfig:
+    """Who is asked, and what they want."""
+
+    groups: list[str] = field(default_factory=list)  # references of rater functions
+    shares: list[float] | None = None  # chance of each group; equal if null
+    count: int = 200  # raters
+    answers: int = 20  # answers of each
+    label: str = "regret"  # what raters compare by: regret or return
+    response: ResponseConfig = field(default_factory=ResponseConfig)
+
+
+@dataclass
+class DataConfig:
+    """The segments that raters see."""
+
+    segments: int = 4000  # segments to collect
+    length: int = 8  # steps of a segment
+    memmap: str | None = None  # folder for memory-mapped storage; in memory if null
+    load: str | None = None  # folder 'data' of an earlier run: its segments and preferences
+    save: bool = True  # keep segments and preferences in the run folder
+
+
+@dataclass
+class MethodConfig:
+    """How the policies are learnt."""
+
+    name: str = "popl"
+    cases: str = "rater"  # what lexicase filters on: rater (needs rater ids) or preference
+    variation: str = "gradient"  # gradient (CPL steps with competition) or gaussian (published)
+    evolve: str = "all"  # all: whole networks; head: last layers on a shared trunk
+    members: int = 32  # policies in the population
+    generations: int = 100
+    hidden: list[int] = field(default_factory=lambda: [64, 64])  # units of each hidden layer
+    epsilon: str | None = "mad"  # tolerance of lexicase: mad, a number, or null for none
+    alpha: float = 0.5  # scale of the scores (CPL's temperature)
+    conservatism: float = 0.9  # lambda of the CPL loss, in (0, 1]
+    discount: float = 1.0  # per-step discount of the scores
+    warm_up: int = 20  # pooled CPL steps before the first generation
+    steps: int = 10  # CPL steps of each child (gradient)
+    batch_size: int = 128  # preferences per CPL step and member (gradient)
+    learning_rate: float = 2e-3  # of Adam (gradient)
+    mutation_std: float = 0.1  # standard deviation of a mutation (gaussian)
+
+
+@dataclass
+class EvaluationConfig:
+    """How the result is judged."""
+
+    episodes: int = 200  # episodes per policy
+    new_raters: int = 20  # new raters of each group that the set is catered to
+    answers: int = 20  # answers of each of them
+    pairs: int = 4000  # fresh pairs per group for accuracies
+    greedy: bool = False  # most likely actions instead of sampled ones
+    baselines: bool = True  # train pooled CPL and the oracle too
+    baseline_steps: int = 1500  # CPL steps of these
+    baseline_batch_size: int = 256  # preferences per step of these
+    baseline_learning_rate: float = 2e-3  # of their Adam
+    baseline_alpha: float = 0.5  # scale of their scores
+    baseline_conservatism: float = 0.9  # lambda of their CPL loss
+    history: int = 10  # generations between two snapshots for the pictures; 0 for none
+
+
+@dataclass
+class LoggerConfig:
+    """Where metrics go besides metrics.csv."""
+
+    name: str = "wandb"  # wandb (offline) or csv (nothing more)
+    project: str = "popl_rl"
+
+
+@dataclass
+class EvaluateConfig:
+    """What popl-evaluate does with a finished run."""
+
+    run_dir: str = MISSING  # folder of the run
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    seed: int = 0  # of the held-out pairs, new raters and episodes
+
+
+@dataclass
+class Config:
+    """A whole run."""
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    raters: RatersConfig = field(default_factory=RatersConfig)
+    data: DataConfig = field(default_factory=DataConfig)
+    method: MethodConfig = field(default_factory=MethodConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    logger: LoggerConfig = field(default_factory=LoggerConfig)
+    seed: int = 0
+    device: str = "cpu"  # where policies are trained: cpu or cuda
+    threads: int = 1  # torch threads; on small networks more is slower
+    run_dir: str | None = None  # folder of the run; runs/<time>-<method>-<seed> if null
+    resume: str | None = None  # folder of a killed run to finish
+    checkpoint_interval: int = 10  # generations between checkpoints
+
+
+def validate(config: Config) -> None:
+    """Check values that can be checked before anything is built.
+
+    Raises:
+        ValueError: Listing every problem at once, each with what was expected and what came.
+    """
+    problems: list[str] = []
+
+    def expect(condition: bool, name: str, expected: str, value: object) -> None:
+        if not condition:
+            problems.append(f"{name} must be {expected}, got {value!r}")
+
+    def at_least_one(section: object, prefix: str, *names: str) -> None:
+        for name in names:
+            value = getattr(section, name)
+            expect(value >= 1, f"{prefix}.{name}", "at least 1", value)
+
+    raters, data, method, evaluation = (
+        config.raters,
+        config.data,
+        config.method,
+        config.evaluation,
+    )
+    at_least_one(config.env, "env", "max_steps")
+    at_least_one(raters, "raters", "count", "answers")
+    at_least_one(data, "data", "segments", "length")
+    at_least_one(evaluation, "evaluation", "episodes", "new_raters", "answers", "pairs")
+    at_least_one(evaluation, "evaluation", "baseline_steps", "baseline_batch_size")
+    at_least_one(method, "method", "members", "generations", "steps", "batch_size")
+    expect(data.segments >= 2, "data.segments", "at least 2, to compare", data.segments)
+    expect(bool(raters.groups), "raters.groups", "one or more rater references", raters.groups)
+    repeated = len(set(raters.groups)) < len(raters.groups)
+    expect(not repeated, "raters.groups", "different groups", raters.groups)
+    if raters.shares is not None:
+        fits = len(raters.shares) == len(raters.groups)
+        expected = f"one number per group ({len(raters.groups)})"
+        expect(fits, "raters.shares", expected, raters.shares)
+        proper = all(share >= 0 for share in raters.shares) and abs(sum(raters.shares) - 1) < 1e-6
+        expect(proper, "raters.shares", "non-negative and sum to 1", raters.shares)
+    expect(raters.label in ("regret", "return"), "raters.label", "regret or return", raters.label)
+    response = raters.response
+    expect(response.rationality > 0, "raters.response.rationality", "positive", response.rationality)
+    expect(0 <= response.mistake <= 1, "raters.response.mistake", "in [0, 1]", response.mistake)
+    expect(0 < response.myopia <= 1, "raters.response.myopia", "in (0, 1]", response.myopia)
+    expect(response.tie >= 0, "raters.response.tie", "at least 0", response.tie)
+    expect(method.cases in ("rater", "preference"), "method.cases", "rater or preference", method.cases)
+    kinds = ("gradient", "gaussian")
+    expect(method.variation in kinds, "method.variation", "gradient or gaussian", method.variation)
+    expect(method.evolve in ("all", "head"), "method.evolve", "all or head", method.evolve)
+    if method.variation == "gaussian":
+        expect(method.evolve == "head", "method.evolve", "head for Gaussian variation", method.evolve)
+    expect(method.members >= 2, "method.members", "at least 2, to select among", method.members)
+    expect(all(units >= 1 for units in method.hidden), "method.hidden", "positive", method.hidden)
+    expect(method.alpha > 0, "method.alpha", "positive", method.alpha)
+    expect(0 < method.conservatism <= 1, "method.conservatism", "in (0, 1]", method.conservatism)
+    expect(0 < method.discount <= 1, "method.discount", "in (0, 1]", method.discount)
+    expect(method.warm_up >= 0, "method.warm_up", "at least 0", method.warm_up)
+    expect(method.learning_rate > 0, "method.learning_rate", "positive", method.learning_rate)
+    expect(method.mutation_std > 0, "method.mutation_std", "positive", method.mutation_std)
+    try:
+        parse_epsilon(method.epsilon)
+    except ValueError as error:
+        problems.append(str(error))
+    expect(evaluation.history >= 0, "evaluation.history", "at least 0", evaluation.history)
+    names = ("wandb", "csv")
+    expect(config.logger.name in names, "logger.name", "wandb or csv", config.logger.name)
+    expect(config.threads >= 1, "threads", "at least 1", config.threads)
+    expect(config.checkpoint_interval >= 1, "checkpoint_interval", "at least 1", config.checkpoint_interval)
+    if data.load is not None:
+        found = (Path(data.load) / "segments").is_dir()
+        expect(found, "data.load", "the folder 'data' of an earlier run", data.load)
+    if problems:
+        raise ValueError("the configuration has problems:\n  " + "\n  ".join(problems))
+
+
+def parse_epsilon(epsilon: str | float | None) -> float | str | None:
+    """Read ``method.epsilon``: ``"mad"``, a non-negative number, or None.
+
+    Raises:
+        ValueError: If it is something else.
+    """
+    if epsilon is None or epsilon == "mad":
+        return epsilon
+    try:
+        value = float(epsilon)
+    except ValueError:
+        value = -1.0
+    if not value >= 0:
+        raise ValueError(
+            f"method.epsilon must be mad, a number of at least 0, or null, got {epsilon!r}"
+        )
+    return value

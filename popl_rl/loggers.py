@@ -1,0 +1,197 @@
+"""Where a run reports to while it goes on: Weights & Biases offline, and a progress bar."""
+
+import io
+import os
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import pandas as pd
+from matplotlib.figure import Figure
+from PIL import Image
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as RichProgress
+
+__all__ = ["Progress", "RunLogger", "make_logger"]
+
+
+class RunLogger:
+    """Where a run reports to, besides its own folder. This one reports nowhere.
+
+    Use it as a context manager, or call :meth:`close`.
+    """
+
+    def log(self, metrics: Mapping[str, float], step: int) -> None:
+        """Report the scalars of one step together."""
+
+    def log_figures(self, figures: Mapping[str, Figure | Path], step: int) -> None:
+        """Report pictures, given as figures or as files."""
+
+    def log_table(self, name: str, table: pd.DataFrame) -> None:
+        """Report a table."""
+
+    def close(self) -> None:
+        """Finish; the logger is not used afterwards."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class _WandbRunLogger(RunLogger):
+    """Reports to an offline Weights & Biases run in the run folder, through TorchRL's logger."""
+
+    def __init__(self, run_dir: Path, *, project: str, config: dict[str, Any]) -> None:
+        # Slow to import, and not needed for logger=csv.
+        import wandb
+        from torchrl.record.loggers.wandb import WandbLogger
+
+        self._wandb = wandb
+        # Before TorchRL sets WANDB_MODE: the first setup in a process fixes wandb's defaults,
+        # which must not become offline for other runs in this process.
+        wandb.setup()
+        with _restored("WANDB_MODE"):
+            self._logger = WandbLogger(
+                run_dir.resolve().name,
+                offline=True,
+                save_dir=run_dir,
+                project=project,
+                log_env_packages=False,
+                mode="offline",
+                settings=wandb.Settings(silent=True, console="off"),
+            )
+        self._logger.log_hparams(config)
+
+    def log(self, metrics: Mapping[str, float], step: int) -> None:
+        self._logger.log_metrics(dict(metrics), step=step)
+
+    def log_figures(self, figures: Mapping[str, Figure | Path], step: int) -> None:
+        images = {}
+        for name, figure in figures.items():
+            if isinstance(figure, Figure):
+                png = io.BytesIO()
+                figure.savefig(png, format="png")
+                images[f"figures/{name}"] = self._wandb.Image(Image.open(png))
+            else:
+                images[f"figures/{name}"] = self._wandb.Image(str(figure))
+        self._logger.experiment.log({**images, "figures/step": step})
+
+    def log_table(self, name: str, table: pd.DataFrame) -> None:
+        self._logger.experiment.log({f"tables/{name}": self._wandb.Table(dataframe=table)})
+
+    def close(self) -> None:
+        self._logger.experiment.finish()
+
+
+def make_logger(
+    name: Literal["wandb", "csv"], run_dir: Path, *, project: str, config: dict[str, Any]
+) -> RunLogger:
+    """Make the logger that a run reports to besides its own files.
+
+    Args:
+        name: ``"wandb"`` for an offline Weights & Biases run under ``run_dir/wandb``, which needs
+            neither network nor account and is sent later with ``wandb sync``; ``"csv"`` for
+            nothing but the run's own ``metrics.csv``.
+        run_dir: Folder of the run.
+        project: Project the run belongs to.
+        config: Resolved configuration, as plain values.
+
+    Returns:
+        The logger; that of ``"csv"``, with one warning, if Weights & Biases does not start.
+
+    Raises:
+        ValueError: If ``name`` is unknown.
+    """
+    if name == "csv":
+        return RunLogger()
+    if name != "wandb":
+        raise ValueError(f"logger must be 'wandb' or 'csv', got {name!r}")
+    try:
+        return _WandbRunLogger(run_dir, project=project, config=config)
+    except ImportError as error:
+        cure = "install it with 'pip install wandb'"
+        reason: Exception = error
+    except Exception as error:  # whatever goes wrong there, a run does not depend on it
+        cure = "see the logs in its wandb folder"
+        reason = error
+    warnings.warn(
+        f"logging to metrics.csv only, Weights & Biases did not start ({reason}); {cure}, or "
+        "choose logger=csv",
+        stacklevel=2,
+    )
+    return RunLogger()
+
+
+@contextmanager
+def _restored(variable: str) -> Iterator[None]:
+    before = os.environ.get(variable)
+    try:
+        yield
+    finally:
+        if before is None:
+            os.environ.pop(variable, None)
+        else:
+            os.environ[variable] = before
+
+
+class Progress:
+    """A progress bar on stderr; silent where that is not a terminal.
+
+    Args:
+        description: What is going on.
+        total: Number of generations.
+        completed: Generations done before, when a run is resumed.
+        console: Where to draw; None for stderr.
+
+    Example:
+        >>> with Progress("training", total=60) as progress:  # doctest: +SKIP
+        ...     progress.update(1, worst_rater_accuracy=0.61)
+    """
+
+    def __init__(
+        self, description: str, *, total: int, completed: int = 0, console: Console | None = None
+    ) -> None:
+        console = console or Console(stderr=True)
+        self._bar = RichProgress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[metrics]}"),
+            TimeRemainingColumn(compact=True),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task(description, total=total, completed=completed, metrics="")
+
+    def update(self, completed: int, **fields: float) -> None:
+        """Show how far it is.
+
+        Args:
+            completed: Generations done.
+            fields: Scalars to show beside the bar, with ``_`` in their names read as a space.
+        """
+        metrics = ", ".join(f"{name.replace('_', ' ')} {x:.3g}" for name, x in fields.items())
+        self._bar.update(self._task, completed=completed, metrics=metrics)
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._bar.stop()

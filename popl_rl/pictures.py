@@ -1,0 +1,116 @@
+"""The pictures of a run, drawn from its files and its scoreboard."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+
+from popl_rl import plots
+from popl_rl.experiment import World
+from popl_rl.keys import INFO
+from popl_rl.policy_set import PolicySet
+from popl_rl.results import Judge, Scoreboard
+from popl_rl.rollouts import MASK
+
+__all__ = ["draw", "occupancy_map"]
+
+
+def occupancy_map(episodes: TensorDictBase, cells: torch.Tensor) -> NDArray[np.float64]:
+    """Share of steps spent in each cell of a grid.
+
+    Args:
+        episodes: With ``("info", "state")``, ``[..., H]``.
+        cells: Column and row of every state, ``[S, 2]``.
+
+    Returns:
+        ``[rows, columns]``, summing to 1.
+    """
+    state = episodes[INFO, "state"][episodes[MASK]].long()
+    column, row = cells[state].unbind(-1)
+    counts = torch.zeros(int(cells[:, 1].max()) + 2, int(cells[:, 0].max()) + 2)
+    counts.index_put_((row, column), torch.ones(len(state)), accumulate=True)
+    share: NDArray[np.float64] = (counts / counts.sum()).double().numpy()
+    return share
+
+
+def draw(
+    run_dir: Path,
+    policies: PolicySet,
+    baselines: PolicySet | None,
+    *,
+    board: Scoreboard,
+    judge: Judge,
+    world: World,
+) -> dict[str, Path]:
+    """Draw every picture that the run has the data for, into ``run_dir/figures``.
+
+    The occupancy map needs an environment with ``cells`` (column and row of every state) and
+    ``("info", "state")``.
+
+    Returns:
+        Name and file of each picture.
+    """
+    folder = run_dir / "figures"
+    folder.mkdir(exist_ok=True)
+    names = [group.name for group in judge.groups]
+    metrics = pd.read_csv(run_dir / "metrics.csv")
+    figures = {
+        "recovery": plots.recovery_bars(board.results),
+        "learning": plots.learning_curves(metrics),
+        "selection": plots.selection(metrics),
+    }
+    history = run_dir / "history.csv"
+    if history.exists() and len(names) > 1:
+        snapshots = pd.read_csv(history)
+        columns = [[c for c in snapshots if c.rsplit("/", 1)[0] == name] for name in names]
+        accuracy = np.stack([snapshots[column].to_numpy() for column in columns], -1)
+        pooled, oracle = None, None
+        if baselines is not None:
+            rows = judge.accuracy(baselines).numpy()
+            pooled = rows[0]
+            oracle = {name: rows[1 + index] for index, name in enumerate(names)}
+        figures["members"] = plots.members(
+            accuracy,
+            snapshots.generation.tolist(),
+            names,
+            catered={name: policies.origin[index] for name, index in board.catered.items()},
+            pooled=pooled,
+            oracle=oracle,
+        )
+    cells = getattr(world.env.unwrapped, "cells", None)
+    if cells is not None:
+        maps = {
+            f"set, catered to {name}": occupancy_map(board.episodes["popl", name], cells)
+            for name in names
+        }
+        if baselines is not None:
+            maps["pooled CPL"] = occupancy_map(board.episodes["cpl", names[0]], cells)
+        figures["occupancy"] = plots.occupancy(
+            picture(world),
+            maps,
+            suptitle="Where the policies go",
+            caption="Each rater group gets its own policy from the set; pooled CPL is one policy "
+            "for everybody.",
+        )
+    paths = {}
+    for name, figure in figures.items():
+        paths[name] = folder / f"{name}.png"
+        plots.save(figure, paths[name])
+    return paths
+
+
+def picture(world: World) -> NDArray[np.uint8] | None:
+    """A picture of the environment at a start, or None if it draws none."""
+    inner = world.env.unwrapped
+    if "rgb_array" not in inner.metadata.get("render_modes", []):
+        return None
+    before, inner.render_mode = inner.render_mode, "rgb_array"
+    try:
+        inner.reset(seed=0)
+        image = inner.render()
+    finally:
+        inner.render_mode = before
+    return None if image is None else np.asarray(image, dtype=np.uint8)

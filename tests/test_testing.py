@@ -1,0 +1,429 @@
+import math
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+from popl_rl import registry
+from popl_rl.planning import Table, policy_return
+from popl_rl.raters import make_groups
+from popl_rl.testing import check_env, check_rater, likes_left, likes_right, main, tiny_env
+
+Box, Discrete = gymnasium.spaces.Box, gymnasium.spaces.Discrete
+Good = type(tiny_env())
+
+
+class Broken(Good):
+    """A tiny environment in which one thing is replaced."""
+
+    def __init__(self, **replaced):
+        super().__init__(max_steps=20)
+        for name, value in replaced.items():
+            setattr(self, name, value)
+
+    def reset(self, *, seed=None, options=None):
+        answer = super().reset(seed=seed, options=options)
+        return self.change_reset(*answer)
+
+    def step(self, action):
+        return self.change_step(*super().step(action))
+
+    def change_reset(self, *answer):
+        return answer
+
+    def change_step(self, *answer):
+        return answer
+
+
+def stepping(**changed):
+    """An environment whose steps answer with something else, or a function of what they should."""
+    fields = ("observation", "reward", "terminated", "truncated", "info")
+
+    def change(*answer):
+        wrong = [changed.get(field, value) for field, value in zip(fields, answer, strict=True)]
+        return tuple(
+            new(old) if callable(new) else new for new, old in zip(wrong, answer, strict=True)
+        )
+
+    return lambda: Broken(change_step=change)
+
+
+def with_table(change):
+    def make():
+        env = Broken()
+        table = env.transition_table()
+        env.transition_table = lambda: change(table)
+        return env
+
+    return make
+
+
+def replaced_row(key, value):
+    def change(table):
+        steps = table.steps.clone()
+        steps[key][:] = value
+        return Table(steps, table.next_state, table.terminal, table.start)
+
+    return with_table(change)
+
+
+class Unseeded(Good):
+    def reset(self, **_):
+        return super().reset()
+
+
+class OneBuffer(Good):
+    """Writes every observation into the same array."""
+
+    def __init__(self):
+        super().__init__(max_steps=20)
+        self.buffer = np.zeros(5, dtype=np.float32)
+
+    def _observation(self):
+        self.buffer[:] = super()._observation()
+        return self.buffer
+
+
+class Failing(Good):
+    def step(self, _):
+        raise RuntimeError("the motor is stuck")
+
+
+class Behaving(Good):
+    def __init__(self, found):
+        super().__init__(max_steps=20)
+        self.found = found
+
+    def behaviours(self):
+        return self.found
+
+
+BROKEN_ENVS = {
+    "not an env": (lambda: 3, TypeError, "must return a gymnasium.Env, got a int; subclass"),
+    "fails to be made": (lambda: 1 / 0, ValueError, "making it failed with ZeroDivisionError"),
+    "dict observations": (
+        lambda: Broken(observation_space=gymnasium.spaces.Dict({})),
+        TypeError,
+        "Box with one dimension, got Dict.*FlattenObservation",
+    ),
+    "float64 space": (
+        lambda: Broken(observation_space=Box(0, 1, (5,), np.float64)),
+        TypeError,
+        "observation_space must be float32, got float64.*DtypeObservation",
+    ),
+    "shifted actions": (
+        lambda: Broken(action_space=Discrete(2, start=1)),
+        ValueError,
+        "actions must start at 0",
+    ),
+    "many actions at once": (
+        lambda: Broken(action_space=gymnasium.spaces.MultiDiscrete([2, 2])),
+        TypeError,
+        "action_space must be Discrete or a Box",
+    ),
+    "unbounded actions": (
+        lambda: Broken(action_space=Box(-np.inf, np.inf, (2,))),
+        ValueError,
+        "must be bounded.*give it low and high",
+    ),
+    "reset without info": (
+        lambda: Broken(change_reset=lambda observation, _: observation),
+        TypeError,
+        r"reset must return \(observation, info\), got a ndarray",
+    ),
+    "old step": (
+        lambda: Broken(change_step=lambda *answer: answer[:4]),
+        TypeError,
+        r"step must return \(observation, reward.*got 4 values",
+    ),
+    "fails in a step": (
+        lambda: Failing(20),
+        ValueError,
+        "step failed with RuntimeError: the motor is stuck",
+    ),
+    "list observation": (
+        stepping(observation=lambda o: o.tolist()),
+        TypeError,
+        "float32 arrays, got list; use",
+    ),
+    "float64 observation": (
+        stepping(observation=lambda o: o.astype(float)),
+        TypeError,
+        "float32 arrays, got float64",
+    ),
+    "NaN observation": (
+        stepping(observation=lambda o: o * np.float32("nan")),
+        ValueError,
+        "observations must be finite",
+    ),
+    "outside the space": (
+        stepping(observation=lambda o: o * 7),
+        ValueError,
+        "must lie in Box.*values from 0 to 7; correct the space",
+    ),
+    "other shape": (
+        stepping(observation=lambda o: o[:4]),
+        ValueError,
+        r"must lie in Box.*got shape \(4,\)",
+    ),
+    "one buffer": (OneBuffer, ValueError, "changed after it was returned; return a copy"),
+    "no number as reward": (
+        stepping(reward=None),
+        TypeError,
+        "reward must be a number, got a NoneType",
+    ),
+    "NaN reward": (
+        stepping(reward=math.nan),
+        ValueError,
+        "reward must be finite",
+    ),
+    "terminated is no bool": (
+        stepping(terminated=0),
+        TypeError,
+        "terminated must be a bool, got a int; use bool",
+    ),
+    "truncated is no bool": (
+        stepping(truncated=None),
+        TypeError,
+        "truncated must be a bool, got a NoneType",
+    ),
+    "info is no dict": (
+        stepping(info=[]),
+        TypeError,
+        "info must be a dict, got a list",
+    ),
+    "info changes keys": (
+        stepping(info={"state": 0}),
+        ValueError,
+        r"same keys.*got \['next_state', 'state'\] and then \['state'\]; fill",
+    ),
+    "info is no number": (
+        stepping(info=lambda i: {**i, "state": "left"}),
+        TypeError,
+        r"info\['state'\] must be a number, got a str; use",
+    ),
+    "info is an array": (
+        stepping(info=lambda i: {**i, "state": np.zeros(())}),
+        TypeError,
+        r"info\['state'\] must be a number, got a ndarray; use float",
+    ),
+    "info is NaN": (
+        stepping(info=lambda i: {**i, "state": math.nan}),
+        ValueError,
+        r"info\['state'\] must be finite, got nan",
+    ),
+    "unseeded": (lambda: Unseeded(20), ValueError, "same seed and actions.*self.np_random only"),
+    "no table": (with_table(lambda _: None), TypeError, "Table, got a NoneType"),
+    "other actions": (
+        lambda: Broken(action_space=Discrete(3)),
+        ValueError,
+        "lists 2 actions, but action_space is Discrete.3.",
+    ),
+    "info without state": (
+        lambda: Broken(
+            change_reset=lambda o, _: (o, {}), change_step=lambda *answer: (*answer[:4], {})
+        ),
+        ValueError,
+        r"info must hold 'state' and 'next_state'.*info has \[\]",
+    ),
+    "state after the step": (
+        stepping(info=lambda i: {**i, "state": i["next_state"]}),
+        ValueError,
+        r"info\['state'\] must be the state before the step",
+    ),
+    "wrong next state": (
+        with_table(lambda t: Table(t.steps, t.next_state.flip(1), t.terminal, t.start)),
+        ValueError,
+        "must agree with stepping, but next_state is .*build both",
+    ),
+    "wrong terminal": (
+        with_table(lambda t: Table(t.steps, t.next_state, ~t.terminal, t.start)),
+        ValueError,
+        "terminal is True at state .* it was False",
+    ),
+    "wrong start": (
+        with_table(lambda t: Table(t.steps, t.next_state, t.terminal, torch.eye(5)[2])),
+        ValueError,
+        "start gives no probability to the first state",
+    ),
+    "wrong reward": (replaced_row("reward", 3.0), ValueError, "reward is 3 at .* got 0"),
+    "wrong observation": (
+        replaced_row("observation", 0.0),
+        ValueError,
+        "observation of state . is not the one seen",
+    ),
+    "wrong info": (
+        replaced_row(("info", "next_state"), 9),
+        ValueError,
+        "info 'next_state' is 9 at state",
+    ),
+    "behaviours are no dict": (lambda: Behaving([]), TypeError, "must return a dict.*got list"),
+    "no behaviours": (lambda: Behaving({}), TypeError, "at least one name"),
+    "behaviour is no policy": (
+        lambda: Behaving({"odd": torch.zeros(5, 2).long()}),
+        TypeError,
+        "behaviour 'odd' must be a float tensor.*got torch.int64",
+    ),
+    "behaviour is no distribution": (
+        lambda: Behaving({"odd": torch.ones(5, 2)}),
+        ValueError,
+        "row of behaviour 'odd'.*softmax",
+    ),
+}
+
+
+@pytest.mark.parametrize(("make", "error", "message"), BROKEN_ENVS.values(), ids=BROKEN_ENVS.keys())
+def test_each_fault_of_an_environment_is_found(make, error, message):
+    with pytest.raises(error, match=message):
+        check_env(make)
+
+
+def test_what_torchrl_refuses_is_reported(monkeypatch):
+    def refuse(env):
+        raise AssertionError("specs differ")
+
+    monkeypatch.setattr("popl_rl._env_checks.check_env_specs", refuse)
+    with pytest.raises(ValueError, match="failed with AssertionError: specs differ"):
+        check_env(tiny_env)
+
+
+def test_an_environment_can_be_given_in_three_ways():
+    check_env(tiny_env)
+    check_env(tiny_env())
+    check_env("popl_rl.testing:tiny_env", max_steps=3)
+    check_env(lambda: Behaving({"left": torch.eye(2)[[0] * 5], "own": lambda *_: 0}))
+    with pytest.raises(TypeError, match="or a reference to it, got a int"):
+        check_env(3)
+    with pytest.raises(TypeError, match="takes no arguments"):
+        check_env(tiny_env(), max_steps=3)
+
+
+def test_an_environment_of_another_author():
+    make = lambda: gymnasium.make("Pendulum-v1")  # noqa: E731
+    check_env(make)
+    check_rater(lambda segments: -segments["action"].square().sum(-1), make)
+
+
+def test_checking_leaves_the_global_randomness_alone():
+    before = torch.random.get_rng_state()
+    check_env(tiny_env)
+    check_rater(likes_left)
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+def test_importing_registers_nothing():
+    assert "tiny_env" not in registry.names("env")
+    assert "likes_left" not in registry.names("rater")
+
+
+def test_tiny_raters_by_hand():
+    table = tiny_env().transition_table()
+    left, right = make_groups([likes_left, likes_right], table=table)
+    assert left.step_utility(table.steps)[1].tolist() == [1.0, 0.5]
+    assert right.step_utility(table.steps)[1].tolist() == [0.0, 0.5]
+    assert left.advantages.argmax(1).tolist() == [0] * 5
+    assert right.advantages.argmax(1).tolist() == [1] * 5
+    # From cells 0 to 4 two steps left are worth 2, 2, 7/4, 5/4 and 3/4.
+    go_left = torch.eye(2)[left.advantages.argmax(1)]
+    value = policy_return(table, go_left, left.step_utility(table.steps), horizon=2)
+    assert value == pytest.approx((2 + 2 + 1.75 + 1.25 + 0.75) / 5)
+
+
+class Fickle:
+    __name__ = "fickle"
+    calls = 0
+
+    def __call__(self, segments):
+        self.calls += 1
+        return likes_left(segments) + self.calls
+
+
+def modifies(segments):
+    segments["observation"].mul_(0)
+    return likes_left(segments)
+
+
+def adds_a_key(segments):
+    segments["seen"] = segments["reward"]
+    return likes_left(segments)
+
+
+def normalises(segments):
+    utility = likes_left(segments)
+    return utility - utility.mean()
+
+
+def squeezes(segments):
+    return likes_left(segments).squeeze()
+
+
+def only_discrete(segments):
+    return segments["observation"]
+
+
+BROKEN_RATERS = [
+    (modifies, ValueError, "'modifies' must leave segments as they are.*work on a copy"),
+    (adds_a_key, ValueError, "must leave segments as they are"),
+    (Fickle(), ValueError, "'fickle' must give the same utility each time"),
+    (normalises, ValueError, "must judge each segment by itself.*do not normalise"),
+    (squeezes, ValueError, r"'squeezes' must return one utility per step, shape \[1, 5\]"),
+    (only_discrete, ValueError, "reduce the last dimension"),
+    (lambda s: s["action"], TypeError, "must return floats"),
+    (lambda s: s["reward"] / 0, ValueError, "finite"),
+    (lambda s: s["speed"], ValueError, "KeyError"),
+    (lambda _: 3.0, TypeError, "got a float"),
+]
+
+
+@pytest.mark.parametrize(("rater", "error", "message"), BROKEN_RATERS)
+def test_each_fault_of_a_rater_is_found(rater, error, message):
+    with pytest.raises(error, match=message):
+        check_rater(rater)
+
+
+def test_a_utility_of_the_whole_segment_is_warned_of():
+    def smooth(segments):
+        return likes_left(segments).cumsum(1)
+
+    with pytest.warns(UserWarning, match="'smooth' gives a step another utility alone"):
+        check_rater(smooth)
+
+
+def test_a_rater_can_be_given_in_two_ways():
+    check_rater(likes_left)
+    check_rater("popl_rl.testing:likes_right", tiny_env, max_steps=1)
+    check_rater("third", "two_doors", doors=3)
+
+
+def test_command_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text("def rude(segments):\n    return segments['shoe\\nsize']\n")
+    assert main(["env", "two_doors", "--with", "doors=3", "start=anywhere"]) == 0
+    assert capsys.readouterr().out == "env two_doors: all checks passed\n"
+    assert main(["rater", "lower", "--env", "two_doors", "--with", "size=7"]) == 0
+    assert capsys.readouterr().out == "rater lower: all checks passed\n"
+    assert main(["rater", "mine.py:rude"]) == 2
+    faults = capsys.readouterr()
+    assert faults.out == ""
+    assert faults.err.startswith("rater 'rude' failed on segments")
+    assert faults.err.count("\n") == 1
+    assert main(["env", "two_door"]) == 2
+    assert "Did you mean 'two_doors'?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments", [[], ["env"], ["env", "two_doors", "--with", "doors"]])
+def test_command_line_misuse(arguments, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert "usage: python -m popl_rl.testing" in capsys.readouterr().err
+
+
+def test_module_runs():
+    command = [sys.executable, "-m", "popl_rl.testing", "env", "popl_rl.testing:tiny_env"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == "env popl_rl.testing:tiny_env: all checks passed\n"

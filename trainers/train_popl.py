@@ -1,0 +1,218 @@
+"""Train a policy set with POPL, from nothing to a report: ``popl-train``.
+
+Collects behaviour, asks simulated raters, evolves a population of policies by lexicase selection,
+and shows what the set is worth to every hidden group beside pooled CPL and the oracle.
+
+    popl-train                                   # two doors, two hidden groups
+    popl-train raters=three_groups env.options.doors=3
+    popl-train method.cases=preference           # without rater ids
+    popl-train -m seed=0,1,2                     # a sweep
+    popl-train resume=runs/<name>                # finish a killed run
+"""
+
+import shutil
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import hydra
+import pandas as pd
+import torch
+from omegaconf import OmegaConf
+from rich.console import Console
+
+from popl_rl.baselines import group_weights, train_cpl
+from popl_rl.comparisons import Comparisons
+from popl_rl.config import Config, validate
+from popl_rl.experiment import build_groups, build_popl, build_world, make_data, stream
+from popl_rl.keys import ANSWER, GROUP, Answer
+from popl_rl.loggers import make_logger
+from popl_rl.pictures import draw
+from popl_rl.policies import PolicySpec
+from popl_rl.policy_set import PolicySet
+from popl_rl.report import markdown, results_table
+from popl_rl.results import Judge, Scoreboard
+from popl_rl.runs import (
+    MetricsWriter,
+    Progress,
+    create_run_dir,
+    load_config,
+    save_config,
+    write_atomic,
+    write_metadata,
+)
+from popl_rl.segments import SegmentBank
+from popl_rl.trainer import POPLTrainer
+from popl_rl.trainers.command import register_schemas, run_command
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a run leaves behind."""
+
+    run_dir: Path
+    policies: PolicySet
+    board: Scoreboard
+
+
+def run(config: Config) -> Result:
+    """Run everything a configuration describes."""
+    # 1. The run folder, and what is to be done.
+    if config.resume is not None:
+        run_dir = create_run_dir(Path(config.resume), name="", resume=True)
+        stored: Any = OmegaConf.merge(OmegaConf.structured(Config), load_config(run_dir))
+        config = stored
+        validate(config)
+    else:
+        validate(config)
+        name = f"{config.method.name}-seed{config.seed}"
+        wanted = None if config.run_dir is None else Path(config.run_dir)
+        run_dir = create_run_dir(wanted, name=name)
+        save_config(run_dir, config)
+    write_metadata(run_dir, command=sys.argv)
+    torch.set_num_threads(config.threads)
+    settings = OmegaConf.to_container(OmegaConf.structured(config), resolve=True)
+
+    # 2. World, raters, and what they say.
+    world = build_world(config.env)
+    groups = build_groups(config.raters, world)
+    kept = run_dir / "data"
+    load = kept if (kept / "preferences").is_dir() else None
+    if load is None and config.data.load is not None:
+        load = Path(config.data.load)
+    with Progress("segments", total=config.data.segments) as progress:
+        data = make_data(
+            config.data,
+            config.raters,
+            world,
+            groups,
+            seed=config.seed,
+            max_steps=config.env.max_steps,
+            load=load,
+            progress=progress.update,
+        )
+    if config.data.save:
+        data.save(kept)
+    bank = SegmentBank.from_segments(data.steps).to(config.device)
+    comparisons = Comparisons.from_preferences(data.preferences, cases=config.method.cases)
+    comparisons = comparisons.to(config.device)
+
+    # 3. The population, evolved.
+    learner = stream(config.seed, "learner", config.device)
+    spec = PolicySpec.from_env(world.env, hidden=config.method.hidden)
+    popl = build_popl(config.method, spec, bank, comparisons, generator=learner)
+    judge = Judge(
+        world, config.env, config.evaluation, groups, bank, data.worth, seed=config.seed
+    )
+    metrics = MetricsWriter(run_dir / "metrics.csv")
+    history = MetricsWriter(run_dir / "history.csv")
+    generations = config.method.generations
+    with (
+        make_logger(
+            config.logger.name, run_dir, project=config.logger.project, config=settings
+        ) as logger,
+        Progress("generations", total=generations) as progress,
+    ):
+
+        def on_generation(generation: int, values: dict[str, float]) -> None:
+            metrics.write(generation, values)
+            logger.log(values, generation)
+            worst = values["worst_rater_accuracy"]
+            progress.update(generation, worst_rater_accuracy=worst)
+            every = config.evaluation.history
+            if every and (generation % every == 0 or generation in (1, generations)):
+                now = PolicySet(popl.population, alpha=popl.alpha, discount=popl.discount)
+                history.write(generation, judge.snapshot(now))
+
+        trainer = POPLTrainer(
+            popl,
+            generations=generations,
+            checkpoint_dir=run_dir / "checkpoint",
+            checkpoint_interval=config.checkpoint_interval,
+            on_generation=on_generation,
+        )
+        done = trainer.resume()
+        metrics.truncate_to(done)
+        history.truncate_to(done)
+        trainer.train()
+        policies = PolicySet.distinct(
+            popl.population, bank, comparisons, alpha=popl.alpha, discount=popl.discount
+        )
+        _save_anew(policies, run_dir / "policies")
+
+        # 4. What the set is compared with, on the same data.
+        baselines = None
+        if config.evaluation.baselines:
+            strict = data.preferences[ANSWER] <= Answer.SECOND
+            weight = group_weights(data.preferences[GROUP][strict], len(groups))
+            with Progress("baselines", total=config.evaluation.baseline_steps) as baseline_bar:
+                baselines = train_cpl(
+                    spec,
+                    bank,
+                    comparisons,
+                    weight.to(config.device),
+                    steps=config.evaluation.baseline_steps,
+                    batch_size=config.evaluation.baseline_batch_size,
+                    learning_rate=config.evaluation.baseline_learning_rate,
+                    alpha=config.evaluation.baseline_alpha,
+                    conservatism=config.evaluation.baseline_conservatism,
+                    generator=stream(config.seed, "baselines", config.device),
+                    progress=baseline_bar.update,
+                )
+            _save_anew(baselines, run_dir / "baselines")
+
+        # 5. Judged by every hidden group; told in a table, in pictures and in words.
+        board = judge.score(policies, baselines)
+        write_atomic(run_dir / "results.csv", board.results.to_csv(index=False))
+        figures = draw(
+            run_dir, policies, baselines, board=board, judge=judge, world=world
+        )
+        logger.log_figures(figures, generations)
+        logger.log_table("results", board.results)
+    about = {
+        "policies in the set": f"{len(policies)}, effectively "
+        f"{policies.effective_number(bank, comparisons):.1f}",
+        "comparisons": f"{len(comparisons)} strict, {comparisons.num_dropped} ties and skips",
+        "cases": f"{comparisons.num_cases} ({config.method.cases}s)",
+        "seed": config.seed,
+    }
+    text = markdown(
+        board.results,
+        title=f"POPL: {config.method.name} in {config.env.factory}",
+        about=about,
+        figures=[Path("figures") / path.name for path in figures.values()],
+    )
+    write_atomic(run_dir / "report.md", text)
+    return Result(run_dir, policies, board)
+
+
+def _save_anew(policies: PolicySet, path: Path) -> None:
+    """Save a set in the place of what a killed run may have left."""
+    shutil.rmtree(path, ignore_errors=True)
+    policies.save(path)
+
+
+def show(result: Result) -> None:
+    """Print the table and where everything is."""
+    console = Console()
+    console.print(results_table(result.board.results))
+    console.print(f"report, pictures, policies and logs: {result.run_dir}", soft_wrap=True)
+
+
+register_schemas()
+
+
+@hydra.main(version_base="1.3", config_path="pkg://popl_rl.configs", config_name="train")
+def main(cfg: Any) -> None:
+    """Hydra's entry."""
+    show(run(cfg))
+
+
+def cli() -> None:
+    """Console command ``popl-train``."""
+    run_command(main)
+
+
+if __name__ == "__main__":
+    cli()
