@@ -183,22 +183,24 @@ class TwoDoors(MiniGridEnv):
         start[[self._index[state] for state in self._first]] = 1 / len(self._first)
         return Table(steps, next_state, goal, start)
 
-    def behaviours(self) -> dict[str, Tensor]:
-        """Return policies to gather data with: for each door three planners, and "random".
+    def behaviours(self) -> dict[str, "Tensor | Explorer"]:
+        """Return what data can show: planners, an explorer and random actions.
 
         Returns:
-            Name -> ``[S, A]`` probabilities of actions. A planner takes actions with probabilities
-            softmax(advantage / temperature), where the optimal advantages are those of the door's
-            rater group.
+            By name: ``planner/<group>/<temperature>``, tables ``[S, A]`` of action probabilities,
+            softmax(advantage / temperature) of the group's optimal advantages; ``explorer``;
+            ``random``, the uniform table.
         """
         table = self.transition_table()
-        policies = {}
+        behaviours: dict[str, Tensor | Explorer] = {}
         for name, _ in zip(_DOOR_NAMES, self.door_cells, strict=False):
             advantages, _values = solve(table, _GROUPS[name](table.steps))
             for temperature in (0.03, 0.1, 0.3):
-                policies[f"{name}-{temperature}"] = (advantages / temperature).softmax(-1)
-        policies["random"] = torch.full(table.next_state.shape, 1 / 3)
-        return policies
+                probabilities = (advantages / temperature).softmax(-1)
+                behaviours[f"planner/{name}/{temperature}"] = probabilities
+        behaviours["explorer"] = Explorer(table, self.cells)
+        behaviours["random"] = torch.full(table.next_state.shape, 1 / 3)
+        return behaviours
 
     def _state(self) -> _State:
         x, y = self.agent_pos
@@ -232,6 +234,56 @@ class TwoDoors(MiniGridEnv):
         if before[0] < self.wall and after[0] == self.wall:
             return self.door_cells.index(after[:2])
         return -1
+
+
+class Explorer:
+    """Walks to one random cell after the other by a shortest path, through any door.
+
+    Without it no segment shows both doors, and then nothing that raters say about one door has to
+    do with what they say about another: without rater ids the groups could not be told apart.
+
+    Args:
+        table: The world's transitions.
+        cells: Column and row of every state, ``[S, 2]``.
+        slip: Chance of a uniformly random action.
+    """
+
+    def __init__(self, table: Table, cells: Tensor, *, slip: float = 0.1) -> None:
+        self.slip = slip
+        distinct, self._cell = cells.unique(dim=0, return_inverse=True)
+        # Fewest steps from each state to each cell, [cell, state]; never over the goal, where an
+        # episode would end.
+        far = torch.tensor(1e6)
+        distance = torch.where(self._cell == torch.arange(len(distinct)).unsqueeze(1), 0.0, far)
+        while True:
+            ahead = torch.where(table.terminal, far, 1 + distance[:, table.next_state])
+            shorter = torch.minimum(distance, ahead.amin(-1))
+            if torch.equal(shorter, distance):
+                break
+            distance = shorter
+        self._ahead = ahead
+        self._targets = (distance < far).any(1).nonzero().squeeze(-1)
+        ends = table.next_state[table.terminal]
+        self._targets = self._targets[~torch.isin(self._targets, self._cell[ends])]
+        self._target = torch.empty(0, dtype=torch.long)
+
+    def reset(self) -> None:
+        """Forget where everybody was going: a batch of new episodes begins."""
+        self._target = torch.empty(0, dtype=torch.long)
+
+    def __call__(self, step: TensorDictBase, generator: torch.Generator) -> Tensor:
+        """Return the actions ``[B]`` of a batch of walkers."""
+        state = step[INFO, "next_state"].long()
+        drawn = torch.randint(len(self._targets), state.shape, generator=generator)
+        fresh = self._targets[drawn]
+        arrived = self._cell[state] == self._target if len(self._target) else state >= 0
+        self._target = torch.where(arrived, fresh, self._target) if len(self._target) else fresh
+        ahead = self._ahead[self._target, state]
+        tie_break = torch.rand(ahead.shape, generator=generator) * 0.5
+        action = (ahead + tie_break).argmin(-1)
+        random = torch.randint(ahead.shape[-1], state.shape, generator=generator)
+        slips = torch.rand(state.shape, generator=generator) < self.slip
+        return torch.where(slips, random, action)
 
 
 @env("two_doors")

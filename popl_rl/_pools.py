@@ -13,7 +13,6 @@ BLOCK_NS = 200_000  # the fixed cost of one block of draws
 SETTLE_NS = 150_000  # the fixed cost of settling one selection
 
 
-
 class Epsilon:
     """Tolerance per case: given, or the median absolute deviation, worked out where it is needed.
 
@@ -30,11 +29,11 @@ class Epsilon:
     def at(self, cases: Tensor) -> Tensor:
         """Tolerances of the cases at these indices, in their shape."""
         if self.missing:
-            wanted = cases.unique()
+            wanted = torch.unique(cases)
             wanted = wanted[self.values[wanted].isnan()]
-            for part in wanted.split(max(1, 2**22 // len(self.scores))):
-                column = self.scores.gather(1, part.expand(len(self.scores), -1))
-                self.values[part] = median_absolute_deviation(column)
+            for part in torch.split(wanted, max(1, 2**22 // len(self.scores))):
+                columns = self.scores.gather(1, part.expand(len(self.scores), -1))
+                self.values[part] = median_absolute_deviation(columns)
             self.missing -= len(wanted)
         return self.values[cases]
 
@@ -47,8 +46,18 @@ def median_absolute_deviation(values: Tensor) -> Tensor:
 
 def _median(values: Tensor) -> Tensor:
     """Median of each row, the mean of the two middle values if there are two."""
-    half = values.topk(values.shape[1] // 2 + 1, largest=False, sorted=False).values
-    return half.amax(1) if values.shape[1] % 2 else half.topk(2).values.mean(1)
+    half = values.shape[1] // 2 + 1
+    # Seen as ints, floats keep their order once the bits under a minus sign are flipped, and topk
+    # is a third faster on ints.
+    ints = torch.int32 if values.dtype == torch.float32 else torch.int64
+    keys = _flip(values.contiguous().view(ints)).topk(half, largest=False, sorted=False).values
+    lower = _flip(keys).view(values.dtype)
+    return lower.amax(1) if values.shape[1] % 2 else lower.topk(2).values.mean(1)
+
+
+def _flip(keys: Tensor) -> Tensor:
+    largest = torch.iinfo(keys.dtype).max
+    return keys ^ ((keys >> largest.bit_length()) & largest)
 
 
 class PassPools:
@@ -63,11 +72,12 @@ class PassPools:
     epsilon = None
 
     def __init__(self, passes: Tensor) -> None:
-        self.scores = passes.view(torch.uint8)
+        self.scores = passes.contiguous().view(torch.uint8)
         self.packed = _pack(self.scores)  # [member / 8, case]
-        self.cases = (self.packed.amax(0) > 0).logical_and_(self.packed.amin(0) < 255).nonzero()[:, 0]
+        mixed = (self.packed.amax(0) > 0).logical_and_(self.packed.amin(0) < 255)
+        self.cases = mixed.nonzero().view(-1)
         # Cases that half the members pass leave one in a thousand pools undecided after this many.
-        self.block = (len(passes) - 1).bit_length() + 5
+        self.block = (len(passes) - 1).bit_length() + 8
         self.chunk = max(1, 2**24 // (self.block * len(self.packed)))
         bits = torch.arange(8, device=passes.device)
         self.set_bits = (torch.arange(256, device=passes.device)[:, None] >> bits) & 1
@@ -110,7 +120,11 @@ class PassPools:
         self.bits = self.bits[:, selections]
 
     def members(self, selections: Tensor) -> tuple[Tensor, Tensor]:
-        """Who is in these pools, as pairs: (position in ``selections``, member), ``[pair]`` each."""
+        """List who is in these pools.
+
+        Returns:
+            Position in ``selections``, and member, of each pair, ``[pair]`` each.
+        """
         bits = self.bits.index_select(1, selections)
         byte, owner = bits.nonzero().unbind(1)
         pair, bit = self.set_bits[bits[byte, owner].long()].nonzero().unbind(1)
@@ -121,14 +135,15 @@ def _pack(flags: Tensor) -> Tensor:
     """Put eight rows of 0 and 1 into one row of bytes: ``[member, case] -> [member / 8, case]``."""
     packed = flags.new_empty(-(-len(flags) // 8), flags.shape[1])
     rows = max(1, 2**17 // flags.shape[1])  # so that a part stays in the processor's cache
-    for bytes_, part in zip(packed.split(rows), flags.split(8 * rows), strict=True):
+    parts = zip(torch.split(packed, rows), torch.split(flags, 8 * rows), strict=True)
+    for packed_part, part in parts:
         if len(part) % 8:
             # The last member fills the byte up: unlike zeros it splits no case by itself.
             part = torch.cat([part, part[-1:].expand(-len(part) % 8, -1)])
         lanes = part.view(-1, 8, part.shape[1]).unbind(1)
-        bytes_.copy_(lanes[0])
+        packed_part.copy_(lanes[0])
         for lane in range(1, 8):
-            bytes_.add_(lanes[lane], alpha=2**lane)
+            packed_part.add_(lanes[lane], alpha=2**lane)
     return packed
 
 
@@ -140,51 +155,51 @@ class ScorePools:
     Args:
         scores: ``[member, case]``, higher is better.
         epsilon: How far from the best of its pool a member may be; None means not at all.
-        cases: Cases on which the members differ, ``[case]``.
     """
 
-    block = 2
+    block = 1  # one case leaves so few that a second one drawn along with it is often wasted
 
     def __init__(self, scores: Tensor, epsilon: Epsilon | None) -> None:
         self.scores = scores.contiguous()
         self.epsilon = epsilon
-        self.cases = (scores.amin(0) < scores.amax(0)).nonzero()[:, 0]
+        self.cases = (scores.amin(0) < scores.amax(0)).nonzero().view(-1)
         self.chunk = max(1, 2**22 // len(scores))
         floating = scores.dtype.is_floating_point
         self.lowest = -torch.inf if floating else torch.iinfo(scores.dtype).min
 
     def open(self, num_selections: int) -> None:
         """Start this many selections, each with every member in its pool."""
-        self.member: Tensor | None = None  # nobody is out yet: the pairs need no listing
+        self.full = True  # and no need to list everybody
+        self.owner = self.member = self.cases.new_empty(0)
         self.size = self.cases.new_full((num_selections,), len(self.scores))
 
     def narrow(self, cases: Tensor, closed: Tensor | None) -> tuple[Tensor, float]:
-        """Filter each pool by its cases in turn; see `PassPools.narrow`."""
-        tolerances = None if self.epsilon is None else self.epsilon.at(cases)
-        narrowed, work = [], BLOCK_NS
-        for step, case in enumerate(cases):
-            if self.member is None:
-                values = self.scores.gather(1, case.expand(len(self.scores), -1))
-                bar = values.amax(0)
-            else:
-                place = self.member * self.scores.shape[1] + case.gather(0, self.owner)
-                values = self.scores.view(-1).gather(0, place)
-                bar = values.new_full(case.shape, self.lowest)
-                bar.scatter_reduce_(0, self.owner, values, "amax")
-            if tolerances is not None:
-                bar = bar - tolerances[step]
-            kept = values >= (bar if self.member is None else bar.gather(0, self.owner))
-            if closed is not None:
-                kept |= closed[step] if self.member is None else closed[step].gather(0, self.owner)
-            if self.member is None:
-                self.member, self.owner = kept.nonzero().unbind(1)
-            else:
-                stay = kept.nonzero()[:, 0]
-                self.member, self.owner = self.member.gather(0, stay), self.owner.gather(0, stay)
-            before, self.size = self.size, self.owner.bincount(minlength=len(case))
-            narrowed.append(self.size < before)
-            work += 30 * len(values)
-        return torch.stack(narrowed), work
+        """Filter each pool by its case; see `PassPools.narrow`."""
+        case = cases[0]
+        if self.full:
+            values = self.scores.gather(1, case.expand(len(self.scores), -1))
+            best = values.amax(0)
+        else:
+            place = self.member * self.scores.shape[1] + case.gather(0, self.owner)
+            values = self.scores.view(-1).gather(0, place)
+            best = values.new_full(case.shape, self.lowest)
+            best.scatter_reduce_(0, self.owner, values, "amax")
+        bar = best if self.epsilon is None else best - self.epsilon.at(case)
+        kept = values >= self._spread(bar)
+        if closed is not None:
+            kept |= self._spread(closed[0])
+        if self.full:
+            self.member, self.owner = kept.nonzero().unbind(1)
+            self.full = False
+        else:
+            stay = kept.nonzero().view(-1)
+            self.member, self.owner = self.member.gather(0, stay), self.owner.gather(0, stay)
+        before, self.size = self.size, self.owner.bincount(minlength=len(case))
+        return (self.size < before)[None], BLOCK_NS + 30 * values.numel()
+
+    def _spread(self, by_selection: Tensor) -> Tensor:
+        """Give each pair what belongs to its selection."""
+        return by_selection if self.full else by_selection.gather(0, self.owner)
 
     def sizes(self) -> Tensor:
         """Members left in each pool, ``[selection]``."""
@@ -197,11 +212,10 @@ class ScorePools:
 
     def members(self, selections: Tensor) -> tuple[Tensor, Tensor]:
         """Who is in these pools; see `PassPools.members`."""
-        assert self.member is not None
         position = self.owner.new_full(self.size.shape, -1)
         position[selections] = torch.arange(len(selections), device=position.device)
         owner = position.gather(0, self.owner)
-        wanted = (owner >= 0).nonzero()[:, 0]
+        wanted = (owner >= 0).nonzero().view(-1)
         return owner.gather(0, wanted), self.member.gather(0, wanted)
 
 
@@ -242,7 +256,7 @@ class Round:
         self.ended: list[tuple[Tensor, Tensor]] = []  # (selection, behaviour) pairs
         selections = torch.arange(num_selected, device=self.device)
         if len(self.pools.cases):
-            for part in selections.split(self.pools.chunk):
+            for part in torch.split(selections, self.pools.chunk):
                 self._run(part)
         else:
             everyone = torch.arange(len(self.weights), device=self.device)
@@ -292,7 +306,7 @@ class Round:
             elif spent >= self._settling_work(len(selections), pairs):
                 break
         owner, member = pools.members(torch.arange(len(selections), device=self.device))
-        members = member[owner.argsort(stable=True)].split(sizes.tolist())
+        members = torch.split(member[owner.argsort(stable=True)], sizes.tolist())
         self.depth[selections] = depth
         for selection, place, pool in zip(selections, looked.tolist(), members, strict=True):
             self._settle(selection, place, pool)
@@ -386,6 +400,4 @@ class Round:
         return member[torch.searchsorted(mass, ticket, right=True)]
 
     def _uniform(self, *shape: int) -> Tensor:
-        return torch.rand(
-            shape, generator=self.generator, device=self.device, dtype=torch.float64
-        )
+        return torch.rand(shape, generator=self.generator, device=self.device, dtype=torch.float64)

@@ -6,13 +6,15 @@ import torch
 from torch import Tensor
 
 from popl_rl.comparisons import Comparisons
-from popl_rl.losses import CPLLoss, descend
+from popl_rl.losses import CPLLoss, descend, linear_decay
 from popl_rl.policies import PolicySpec
 from popl_rl.policy_set import PolicySet
 from popl_rl.population import Population
 from popl_rl.segments import SegmentBank
 
 __all__ = ["group_weights", "train_cpl"]
+
+_BLOCK = 50  # steps between two changes of the learning rate, and two reports of progress
 
 
 def group_weights(group: Tensor, num_groups: int) -> Tensor:
@@ -72,20 +74,20 @@ def train_cpl(
         K policies, in the order of ``weight``.
     """
     population = Population.create(spec, len(weight), generator=generator).to(weight.device)
-    loss = CPLLoss(
-        population, bank, alpha=alpha, conservatism=conservatism, discount=discount
-    )
+    loss = CPLLoss(population, bank, alpha=alpha, conservatism=conservatism, discount=discount)
     optimizer = torch.optim.Adam(population.members.parameters(), lr=learning_rate)
-    for done in range(0, steps, 50):
+    schedule = linear_decay(optimizer, -(-steps // _BLOCK))
+    for done in range(0, steps, _BLOCK):
         descend(
             loss,
             optimizer,
             comparisons,
-            steps=min(50, steps - done),
+            steps=min(_BLOCK, steps - done),
             batch_size=batch_size,
             weight=weight,
             generator=generator,
         )
+        schedule.step()
         if progress is not None:
-            progress(min(done + 50, steps))
+            progress(min(done + _BLOCK, steps))
     return PolicySet(population, alpha=alpha, discount=discount)

@@ -42,10 +42,16 @@ class Comparisons:
             cases: ``"preference"`` or ``"rater"``.
 
         Raises:
-            ValueError: If ``cases`` is neither, or no strict answer is left.
+            ValueError: If ``cases`` is neither, rater ids are needed and missing, or no answer is
+                strict.
         """
         if cases not in ("preference", "rater"):
             raise ValueError(f"cases must be 'preference' or 'rater', got {cases!r}")
+        if cases == "rater" and RATER not in preferences.keys():  # noqa: SIM118 - not a dict
+            raise ValueError(
+                "preferences must hold 'rater', the id of who answered, for cases='rater'; without "
+                "ids use cases='preference'"
+            )
         answer = preferences[ANSWER]
         strict = answer <= Answer.SECOND
         if not strict.any():
@@ -73,7 +79,7 @@ class Comparisons:
         )
 
     def rows(self, index: Tensor) -> "Comparisons":
-        """Some of the comparisons; case numbers stay as they are."""
+        """Some of the comparisons; cases keep their numbers, and nothing counts as dropped."""
         return Comparisons(
             self.preferred[index], self.other[index], self.case[index], self.num_cases
         )

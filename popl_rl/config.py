@@ -27,6 +27,7 @@ class EnvConfig:
     factory: str = "two_doors"  # registered name, module:attr or file.py:attr
     options: dict[str, Any] = field(default_factory=dict)  # arguments of the factory
     data_options: dict[str, Any] = field(default_factory=dict)  # on top of these, for data only
+    mixture: dict[str, float] | None = None  # share of behaviours in the data, by name or pattern
     id: str | None = None  # id of a Gymnasium environment, for env=gym
     max_steps: int = 60  # steps after which an episode is cut
     success: str = "goal"  # number in info that is positive when the task is done
@@ -61,7 +62,7 @@ class DataConfig:
     """The segments that raters see."""
 
     segments: int = 4000  # segments to collect
-    length: int = 8  # steps of a segment
+    length: int = 16  # steps of a segment
     memmap: str | None = None  # folder for memory-mapped storage; in memory if null
     load: str | None = None  # folder 'data' of an earlier run: its segments and preferences
     save: bool = True  # keep segments and preferences in the run folder
@@ -166,6 +167,11 @@ def validate(config: Config) -> None:
         config.evaluation,
     )
     at_least_one(config.env, "env", "max_steps")
+    mixture = config.env.mixture
+    if mixture is not None:
+        proper = all(share >= 0 for share in mixture.values())
+        proper = proper and abs(sum(mixture.values()) - 1) < 1e-6
+        expect(proper, "env.mixture", "non-negative shares that sum to 1", dict(mixture))
     at_least_one(raters, "raters", "count", "answers")
     at_least_one(data, "data", "segments", "length")
     at_least_one(evaluation, "evaluation", "episodes", "new_raters", "answers", "pairs")

@@ -49,22 +49,26 @@ def roll_out(
 
     Returns:
         TensorDict ``[P, E, H]`` as from :func:`~popl_rl.rollouts.lockstep`.
+
+    Raises:
+        ValueError: If ``episodes`` or ``max_steps`` is not positive, or there is nothing to roll.
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
-    generator = torch.Generator().manual_seed(seed)
-    starts = torch.randint(2**31, (episodes,), generator=generator).tolist()
+    if policies is None and random_action is None:
+        raise ValueError("random_action must be given to roll without policies, got None")
+    device = torch.device("cpu") if policies is None else policies.population.device
+    generator = torch.Generator(device).manual_seed(seed)
+    starts = torch.randint(2**31, (episodes,), generator=generator, device=device).tolist()
     count = 1 if policies is None else len(policies)
 
     def act(step: TensorDictBase) -> Tensor:
-        if policies is None:
-            assert random_action is not None
-            return random_action(step, generator)
-        observation = step[OBSERVATION].unflatten(0, (count, episodes))
-        action = policies.act(
-            observation.to(policies.population.device), greedy=greedy, generator=generator
-        )
-        return action.flatten(0, 1).cpu()
+        if policies is not None:
+            observation = step[OBSERVATION].view(count, episodes, -1).to(device)
+            action = policies.act(observation, greedy=greedy, generator=generator)
+            return action.flatten(0, 1).cpu()
+        assert random_action is not None
+        return random_action(step, generator)
 
     envs = [make_env() for _ in range(count * episodes)]
     try:
@@ -88,7 +92,7 @@ def group_returns(episodes: TensorDictBase, groups: Sequence[RaterGroup]) -> Ten
     flat = episodes.flatten(0, 1)
     mask = flat[MASK].float()
     worth = [(group.step_utility(flat) * mask).sum(1) for group in groups]
-    return torch.stack(worth, -1).unflatten(0, episodes.shape[:2]).mean(1)
+    return torch.stack(worth, -1).view(*episodes.shape[:2], -1).mean(1)
 
 
 def info_rates(episodes: TensorDictBase, key: str) -> dict[int, Tensor]:
@@ -100,9 +104,10 @@ def info_rates(episodes: TensorDictBase, key: str) -> dict[int, Tensor]:
 
 def success_rate(episodes: TensorDictBase, key: str) -> Tensor:
     """Share of episodes in which info ``key`` was ever positive, ``[P]``; NaN without that key."""
-    if key not in episodes[INFO].keys():
+    if (INFO, key) not in episodes.keys(include_nested=True):
         return torch.full(episodes.shape[:1], float("nan"))
-    return ((episodes[INFO, key] > 0) & episodes[MASK]).any(-1).float().mean(-1)
+    done: Tensor = (episodes[INFO, key] > 0) & episodes[MASK]
+    return done.any(-1).float().mean(-1)
 
 
 def recovery(value: float, *, random: float, oracle: float) -> float:
@@ -146,8 +151,8 @@ def group_accuracy(scores: Tensor, pairs: Mapping[int, tuple[Tensor, Tensor]]) -
     Returns:
         ``[P, G]``.
     """
-    columns = [(scores[:, better] > scores[:, worse]).float().mean(1) for better, worse in pairs.values()]
-    return torch.stack(columns, -1)
+    right = [scores[:, better] > scores[:, worse] for better, worse in pairs.values()]
+    return torch.stack([column.float().mean(1) for column in right], -1)
 
 
 def new_rater_answers(

@@ -1,7 +1,8 @@
 """From a configuration to the objects of a run. Configuration objects go no further than here."""
 
+import fnmatch
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -31,6 +32,7 @@ from popl_rl.segments import (
     random_behaviour,
     save_tensordict,
     segment_buffer,
+    stored_segments,
     table_behaviour,
 )
 from popl_rl.variation import GaussianHead, GradientCPL
@@ -57,6 +59,7 @@ class World:
         make_for_data: Builds an environment to collect segments in.
         env: One environment, for its spaces and its picture.
         behaviours: What the data shows.
+        shares: Share of each behaviour in the data.
         table: Exact model, if the environment exposes one.
     """
 
@@ -64,6 +67,7 @@ class World:
     make_for_data: MakeEnv
     env: gymnasium.Env[Any, Any]
     behaviours: Mapping[str, Behaviour]
+    shares: Mapping[str, float]
     table: Table | None
 
 
@@ -111,7 +115,33 @@ def build_world(config: EnvConfig) -> World:
         name: table_behaviour(what) if isinstance(what, Tensor) else what
         for name, what in given.items()
     } or {"random": random_behaviour(env.action_space)}
-    return World(make, make_for_data, env, behaviours, table)
+    shares = behaviour_shares(list(behaviours), config.mixture)
+    return World(make, make_for_data, env, behaviours, shares, table)
+
+
+def behaviour_shares(names: Sequence[str], mixture: Mapping[str, float] | None) -> dict[str, float]:
+    """Share of each behaviour in the data.
+
+    Args:
+        names: Behaviours that there are.
+        mixture: Shares by name or by pattern (``"planner/*"``), which the matching behaviours
+            divide equally; None for equal shares of all.
+
+    Raises:
+        ValueError: If a pattern matches nothing.
+    """
+    if mixture is None:
+        return dict.fromkeys(names, 1 / len(names))
+    shares = dict.fromkeys(names, 0.0)
+    for pattern, share in mixture.items():
+        matching = fnmatch.filter(names, pattern)
+        if not matching:
+            raise ValueError(
+                f"env.mixture {pattern!r} matches no behaviour; there are {', '.join(names)}"
+            )
+        for name in matching:
+            shares[name] += share / len(matching)
+    return shares
 
 
 def build_groups(config: RatersConfig, world: World) -> tuple[RaterGroup, ...]:
@@ -149,7 +179,7 @@ class Data:
     @property
     def steps(self) -> TensorDictBase:
         """The segments as a TensorDict ``[N, T]``."""
-        return self.segments[:].auto_batch_size_(2)
+        return stored_segments(self.segments)
 
     def save(self, path: Path) -> None:
         """Write segments and preferences below ``path``, replacing nothing."""
@@ -191,13 +221,12 @@ def make_data(
             num_segments=config.segments,
             length=config.length,
             generator=stream(seed, "segments"),
+            shares=world.shares,
             max_steps=max_steps,
             progress=progress,
         )
     else:
-        segments = load_tensordict(
-            load / "segments", required={OBSERVATION: 3, ACTION: 2, INFO: 0}
-        )
+        segments = load_tensordict(load / "segments", required={OBSERVATION: 3, ACTION: 2, INFO: 0})
         if len(segments) < config.segments:
             raise ValueError(
                 f"data.segments asks for {config.segments} segments, but {load} holds "
@@ -253,6 +282,7 @@ def build_popl(
         variation = GradientCPL(
             loss,
             comparisons,
+            generations=config.generations,
             learning_rate=config.learning_rate,
             steps=config.steps,
             batch_size=config.batch_size,

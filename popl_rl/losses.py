@@ -4,6 +4,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torch.optim.lr_scheduler import LambdaLR
 from torchrl.objectives.common import LossModule
 
 from popl_rl.comparisons import Comparisons
@@ -11,7 +12,15 @@ from popl_rl.policies import log_prob
 from popl_rl.population import Population
 from popl_rl.segments import SegmentBank
 
-__all__ = ["CPLLoss", "cpl_loss", "descend"]
+__all__ = ["CPLLoss", "cpl_loss", "descend", "linear_decay"]
+
+
+def linear_decay(optimizer: torch.optim.Optimizer, total: int) -> LambdaLR:
+    """Hold the learning rate for the first half of ``total`` calls of ``step``, then let it fall.
+
+    It falls linearly to zero, so that what a sampled policy does no longer swings at the end.
+    """
+    return LambdaLR(optimizer, lambda done: max(0.0, min(1.0, 2 * (1 - done / total))))
 
 
 def cpl_loss(preferred: Tensor, other: Tensor, *, conservatism: float = 1.0) -> Tensor:
@@ -108,8 +117,9 @@ class CPLLoss(LossModule):
         else:
             output = population(bank.observation[row])
         value = log_prob(population.spec, output, action)
-        steps = torch.arange(bank.row.shape[1], device=value.device)
-        return value.unflatten(1, (segment.shape[1], -1)) @ (self.alpha * self.discount**steps)
+        steps = torch.arange(bank.row.shape[1], device=value.device).float()
+        scores: Tensor = value.view(*segment.shape, -1) @ (self.alpha * self.discount**steps)
+        return scores
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of one batch per member.

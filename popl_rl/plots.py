@@ -31,6 +31,7 @@ __all__ = [
     "method_name",
     "occupancy",
     "recovery_bars",
+    "require_columns",
     "save",
     "selection",
 ]
@@ -48,10 +49,10 @@ PALETTE = {
 """Colours that stay apart for colour-blind readers (Okabe and Ito, 2008), and a grey."""
 
 METHODS = {
-    "popl": "POPL, catered",
-    "popl_lexicase": "POPL, catered by lexicase",
+    "popl": "POPL (catered)",
+    "popl_lexicase": "POPL (catered by lexicase)",
     "cpl": "CPL on everybody's answers",
-    "oracle": "oracle: told the groups",
+    "oracle": "oracle (told the groups)",
     "random": "random actions",
 }
 """Names to print for the methods of a results table, in the order to show them in."""
@@ -136,7 +137,7 @@ def occupancy(
             interpolation="nearest",
         )
     bar = fig.colorbar(ScalarMappable(norm, colours), ax=axes, shrink=0.8)
-    bar.ax.yaxis.set_major_formatter(PercentFormatter(1))
+    bar.ax.yaxis.set_major_formatter(lambda share, _: f"{100 * share:.3g}%")
     bar.set_label("share of steps")
     return fig
 
@@ -192,12 +193,13 @@ def members(
     marks = [*_marks(values[-1], group_names, catered, pooled, oracle or {})]
     points = np.concatenate([values.reshape(-1, expected[1]), *(m.point[None] for m in marks)])
     low, high = np.nanmin(points), np.nanmax(points)
-    margin = 0.08 * max(high - low, 0.1)
+    low, high = low - 0.06 * max(high - low, 0.1), high + 0.16 * max(high - low, 0.1)
     pairs = list(itertools.combinations(range(len(group_names)), 2))[:6]
     columns = min(len(pairs), 3)
     lines = math.ceil(len(pairs) / columns)
-    size = 4.6 if len(pairs) == 1 else 3.0
-    fig = Figure(figsize=(size * columns + 1.4, size * lines + 1.9))
+    size = 5.0 if len(pairs) == 1 else 3.0
+    width = size * columns + 1.6
+    fig = Figure(figsize=(width, (size - 0.35) * lines + 1.7))
     _headline(
         fig,
         "Does every group find a policy of its own?",
@@ -205,7 +207,7 @@ def members(
         "Dotted lines: guessing.",
     )
     axes = fig.subplots(lines, columns, squeeze=False)
-    norm = Normalize(min(generations), max(*generations, min(generations) + 1))
+    norm = Normalize(min(*generations, max(generations) - 1), max(generations))
     colours = ListedColormap(colormaps["Greys"](np.linspace(0.22, 0.85, 256)))
     for ax in axes.flat[len(pairs) :]:
         ax.set_axis_off()
@@ -224,8 +226,8 @@ def members(
         ax.set(
             xlabel=f"agrees with “{group_names[x]}”",
             ylabel=f"agrees with “{group_names[y]}”",
-            xlim=(low - margin, high + margin),
-            ylim=(low - margin, high + margin),
+            xlim=(low, high),
+            ylim=(low, high),
             aspect="equal",
         )
         _corner(ax, f"only “{group_names[y]}”", 0.02, "left")
@@ -233,14 +235,16 @@ def members(
         for axis in (ax.xaxis, ax.yaxis):
             axis.set_major_formatter(PercentFormatter(1, decimals=0))
         _tidy(ax)
-    bar = fig.colorbar(
-        ScalarMappable(norm, colours), ax=axes, shrink=0.6, ticks=MaxNLocator(5, integer=True)
-    )
-    bar.set_label("generation of a member")
+    if len(generations) > 1:
+        ticks = MaxNLocator(5, integer=True)
+        bar = fig.colorbar(ScalarMappable(norm, colours), ax=axes, shrink=0.6, ticks=ticks)
+        bar.set_label("generation of a member")
     if shown:
-        fig.legend(
-            shown.values(), shown.keys(), loc="outside lower left", ncols=columns + 1, **_LEGEND
-        )
+        labels = [mark.label for mark in marks if mark.label in shown]
+        # Two rows, filled column by column, keep what belongs to a group together.
+        ncols = min(math.ceil(len(labels) / 2), int(width / 2.1))
+        handles = [shown[label] for label in labels]
+        fig.legend(handles, labels, loc="outside lower left", ncols=ncols, **_LEGEND)
     return fig
 
 
@@ -264,7 +268,7 @@ def _marks(
     for index, (name, colour) in enumerate(zip(group_names, itertools.cycle(_COLOURS))):
         if name in catered:
             ring = {"s": 110, "facecolors": "none", "edgecolors": colour, "linewidths": 2.2}
-            yield _Mark(f"POPL's choice for “{name}”", last[catered[name]], index, ring)
+            yield _Mark(f"POPL for “{name}”", last[catered[name]], index, ring)
         if name in oracle:
             star = {"s": 120, "marker": "*", "color": colour}
             yield _Mark(f"oracle of “{name}”", np.asarray(oracle[name], float), index, star)
@@ -297,7 +301,7 @@ def learning_curves(metrics: pd.DataFrame) -> Figure:
     Raises:
         ValueError: If a column is missing.
     """
-    _require(metrics, ["generation", "worst_rater_accuracy", "mean_accuracy"])
+    require_columns(metrics, ["generation", "worst_rater_accuracy", "mean_accuracy"])
     with_loss = "loss_cpl" in metrics and metrics["loss_cpl"].notna().any()
     fig = Figure(figsize=(7.5, 5.6 if with_loss else 3.8))
     _headline(
@@ -331,7 +335,7 @@ def selection(metrics: pd.DataFrame) -> Figure:
     Raises:
         ValueError: If a column is missing.
     """
-    _require(metrics, ["generation", "selection_depth", "distinct", "effective_parents"])
+    require_columns(metrics, ["generation", "selection_depth", "distinct", "effective_parents"])
     fig = Figure(figsize=(7.5, 5.2))
     _headline(
         fig,
@@ -359,7 +363,7 @@ def recovery_bars(results: pd.DataFrame) -> Figure:
     Raises:
         ValueError: If a column is missing, or no row of measure ``recovery`` holds a number.
     """
-    _require(results, ["method", "group", "measure", "value"])
+    require_columns(results, ["method", "group", "measure", "value"])
     rows = results[(results["measure"] == "recovery") & results["value"].notna()]
     # By definition 1 and 0 for every group; lines show them.
     rows = rows[~rows["method"].isin(["oracle", "random"])]
@@ -404,9 +408,7 @@ def recovery_bars(results: pd.DataFrame) -> Figure:
     _beside(ax, "as good as\nrandom actions", 0, "black")
     ax.set_xticks(range(len(groups)), [f"“{group}”" for group in groups])
     ax.tick_params(axis="x", length=0)
-    ax.set(
-        xlabel="raters who want", ylabel="recovery", ylim=(low - (0.12 if low else 0), high + 0.12)
-    )
+    ax.set(xlabel="raters who want", ylabel="recovery", ylim=(low and low - 0.2, high + 0.15))
     fig.legend(loc="outside lower center", ncols=min(len(methods), 3), **_LEGEND)
     _tidy(ax)
     return fig
@@ -442,7 +444,7 @@ def _line(ax: Axes, metrics: pd.DataFrame, column: str, label: str, colour: str)
     )
     if len(rows):
         _beside(ax, label, rows[column].iloc[-1], PALETTE[colour])
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.xaxis.set_major_locator(MaxNLocator(7, steps=[1, 2, 5, 10], integer=True, min_n_ticks=1))
     _tidy(ax)
 
 
@@ -481,7 +483,8 @@ def _headline(fig: Figure, title: str, subtitle: str) -> None:
     fig.set_layout_engine("constrained", rect=(0, 0, 1, 1 - room))
 
 
-def _require(table: pd.DataFrame, columns: Sequence[str]) -> None:
+def require_columns(table: pd.DataFrame, columns: Sequence[str]) -> None:
+    """Raise ValueError, naming what is missing, unless a table has these columns."""
     missing = [column for column in columns if column not in table]
     if missing:
         raise ValueError(f"the table must have the columns {columns}, {missing} are missing")

@@ -70,7 +70,9 @@ class PolicySpec:
         elif isinstance(action, gymnasium.spaces.Box) and len(action.shape) == 1:
             size, discrete = action.shape[0], False
         else:
-            raise TypeError(f"action_space must be Discrete or a Box of one dimension, got {action}")
+            raise TypeError(
+                f"action_space must be Discrete or a Box of one dimension, got {action}"
+            )
         return cls(observation.shape[0], size, discrete, tuple(hidden), action_std)
 
 

@@ -76,7 +76,7 @@ class PolicySet:
     ) -> "PolicySet":
         """Keep one member for each distinct behaviour (pass or not, on every comparison)."""
         passes = margins(population, bank, comparisons, alpha=alpha, discount=discount) > 0
-        inverse = passes.unique(dim=0, return_inverse=True)[1].tolist()
+        inverse = torch.unique(passes, dim=0, return_inverse=True)[1].tolist()
         first = sorted({behaviour: inverse.index(behaviour) for behaviour in inverse}.values())
         policies = cls(population.subset(first), alpha=alpha, discount=discount)
         policies.origin = first
@@ -96,9 +96,7 @@ class PolicySet:
         similarity = (sign @ sign.T / sign.shape[1]).clamp(min=0)
         return float(1 / similarity.mean())
 
-    def _margins(
-        self, segments: TensorDictBase | SegmentBank, comparisons: Comparisons
-    ) -> Tensor:
+    def _margins(self, segments: TensorDictBase | SegmentBank, comparisons: Comparisons) -> Tensor:
         known = isinstance(segments, SegmentBank)
         bank = segments if known else SegmentBank.from_segments(segments)
         device = self.population.device
@@ -139,7 +137,7 @@ class PolicySet:
         single = observation.ndim == 1
         batch = observation.unsqueeze(0) if single else observation
         if member is None:
-            output = self.population(batch)
+            output: Tensor = self.population(batch)
         else:
             if not 0 <= member < len(self):
                 raise IndexError(f"member must be in 0..{len(self) - 1}, got {member}")
@@ -246,6 +244,7 @@ class PolicySet:
                 "evolve": population.evolve,
                 "alpha": self.alpha,
                 "discount": self.discount,
+                "origin": self.origin,
                 "trunk": trunk,
             }
             (whole / "policy_set.json").write_text(json.dumps(about))
@@ -283,15 +282,28 @@ class PolicySet:
                 if members[key].shape != expected[key].shape:
                     raise ValueError(f"{key} has shape {tuple(members[key].shape)}")
             expected.update_(members)
-        except (KeyError, TypeError, ValueError, RuntimeError, FileNotFoundError) as error:
+            policies = cls(
+                population, alpha=float(about["alpha"]), discount=float(about["discount"])
+            )
+            policies.origin = [int(member) for member in about["origin"]]
+        except (
+            AttributeError,
+            FileNotFoundError,
+            KeyError,
+            RuntimeError,
+            TypeError,
+            ValueError,
+        ) as error:
             raise ValueError(
                 f"{path} is not readable as a policy set ({error}); it is truncated or was "
                 "written by something else; train again or restore the folder"
             ) from error
-        return cls(population, alpha=about["alpha"], discount=about["discount"])
+        return policies
 
     def subset(self, members: Sequence[int]) -> "PolicySet":
         """Some of the policies, in the given order."""
-        return PolicySet(
+        policies = PolicySet(
             self.population.subset(members), alpha=self.alpha, discount=self.discount
         )
+        policies.origin = [self.origin[member] for member in members]
+        return policies

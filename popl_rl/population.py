@@ -50,12 +50,12 @@ class Population(nn.Module):
         split = len(networks[0]) - 1 if evolve == "head" else 0
         self.spec = spec
         self.evolve = evolve
-        self.trunk = networks[0][:split].requires_grad_(False)
+        self.trunk = nn.Sequential(*list(networks[0])[:split]).requires_grad_(False)
         # Sequential(*...) rather than a slice: it numbers the layers from 0.
         own = [nn.Sequential(*list(network)[split:]) for network in networks]
         self.members: TensorDictParams = TensorDict.from_modules(*own, as_module=True)
         self._activations = [
-            None if isinstance(layer, nn.Linear) else layer for layer in networks[0][split:]
+            None if isinstance(layer, nn.Linear) else layer for layer in list(networks[0])[split:]
         ]
 
     @classmethod
@@ -79,7 +79,8 @@ class Population(nn.Module):
     @property
     def device(self) -> torch.device:
         """Where the parameters are."""
-        return next(self.members.parameters()).device
+        device: torch.device = next(self.members.parameters()).device
+        return device
 
     def forward(self, observation: Tensor) -> Tensor:
         """Logits or mean actions of every member.
@@ -162,7 +163,7 @@ def segment_scores(
         ``[N, num_segments]`` float32.
     """
     count, steps = len(population), bank.row.shape[1]
-    weight = alpha * discount ** torch.arange(steps, device=population.device)
+    weight = alpha * discount ** torch.arange(steps, device=population.device).float()
     spec = population.spec
     width = max(spec.observation_dim, *spec.hidden, spec.action_dim, 1)
     budget = int(memory_mb * 2**20)
@@ -175,12 +176,11 @@ def segment_scores(
         for part in _chunks(count, max(1, budget // member_bytes)):
             some = population.with_members(population.members.data[part])
             table = some.from_features(features).log_softmax(-1).flatten(1)
-            steps_log_prob = table[:, cell].unflatten(1, bank.row.shape)
-            scores[part] = steps_log_prob @ weight
+            scores[part] = table[:, cell].view(-1, *bank.row.shape) @ weight
         return scores
     for part in _chunks(len(bank), max(1, budget // (4 * 3 * width * steps * count))):
         observation = bank.observation[bank.row[part]].flatten(0, 1)
         action = bank.action[part].flatten(0, 1)
         value = log_prob(spec, population(observation), action)
-        scores[:, part] = value.unflatten(1, (-1, steps)) @ weight
+        scores[:, part] = value.view(count, -1, steps) @ weight
     return scores

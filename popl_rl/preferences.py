@@ -10,7 +10,7 @@ from torchrl.envs import Transform
 
 from popl_rl.keys import ANSWER, GROUP, PAIR, RATER, UTILITY, Answer
 from popl_rl.raters import Raters
-from popl_rl.segments import load_tensordict
+from popl_rl.segments import load_tensordict, stored_segments
 
 __all__ = ["PreferenceCollector", "collect_preferences", "draw_pairs", "load_preferences"]
 
@@ -30,13 +30,15 @@ class PreferenceCollector(Transform):
         generator: Source of the pairs and of the raters' randomness.
 
     Raises:
-        ValueError: If there are fewer than two segments.
+        ValueError: If there are fewer than two segments; when the buffer is extended, if a query
+            names a rater or a segment that does not exist.
 
     Example:
         >>> preferences = TensorDictReplayBuffer(
         ...     storage=LazyTensorStorage(100), transform=PreferenceCollector(
         ...         segments, raters, generator=generator))  # doctest: +SKIP
-        >>> preferences.extend(TensorDict({"rater": torch.zeros(100).long()}, [100]))  # doctest: +SKIP
+        >>> queries = TensorDict({"rater": torch.zeros(100).long()}, [100])
+        >>> preferences.extend(queries)  # doctest: +SKIP
     """
 
     def __init__(
@@ -52,9 +54,8 @@ class PreferenceCollector(Transform):
         self.segments = segments
         self.raters = raters
         self.generator = generator
-        stored = segments[:].auto_batch_size_(2)
         #: Worth of each segment to each group, ``[G, N]``.
-        self.worth: Tensor = raters.worth(stored)
+        self.worth: Tensor = raters.worth(stored_segments(segments))
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         rater = tensordict[RATER]
@@ -65,6 +66,11 @@ class PreferenceCollector(Transform):
         pair = tensordict.get(PAIR, None)
         if pair is None:
             pair = draw_pairs(len(self.segments), len(rater), generator=self.generator)
+        elif not ((pair >= 0) & (pair < len(self.segments))).all():
+            raise ValueError(
+                f"pair must be segments in 0..{len(self.segments) - 1}, got {pair.min()}.."
+                f"{pair.max()}"
+            )
         group = self.raters.group_of[rater]
         answer = self.raters.answer(pair, rater, self.worth, generator=self.generator)
         out = TensorDict({PAIR: pair, ANSWER: answer, RATER: rater}, [len(rater)])
@@ -121,6 +127,11 @@ def load_preferences(path: Path, *, num_segments: int) -> TensorDict:
     """
     data = load_tensordict(path, required={PAIR: 2, ANSWER: 1, RATER: 1})
     pair, answer = data[PAIR], data[ANSWER]
+    if pair.dtype != torch.int64 or pair.shape != (len(answer), 2) or not len(pair):
+        raise ValueError(
+            f"{path} must hold pairs of segment numbers, int64 of shape [M, 2], got {pair.dtype} "
+            f"of shape {list(pair.shape)} for {len(answer)} answers; it is damaged or foreign"
+        )
     if pair.min() < 0 or pair.max() >= num_segments:
         raise ValueError(
             f"{path} compares segments up to number {int(pair.max())}, but there are "

@@ -49,8 +49,13 @@ def lockstep(
         hold zeros and ``mask`` False.
 
     Raises:
-        ValueError: If the numbers of environments and seeds differ.
+        ValueError: If there are no environments, the numbers of environments and seeds differ, or
+            ``max_steps`` is not positive.
     """
+    if not envs:
+        raise ValueError("envs must hold at least one environment, got none")
+    if max_steps < 1:
+        raise ValueError(f"max_steps must be at least 1, got {max_steps}")
     if len(envs) != len(seeds):
         raise ValueError(f"seeds must be one per environment ({len(envs)}), got {len(seeds)}")
     starts = [env.reset(seed=int(seed)) for env, seed in zip(envs, seeds, strict=True)]
@@ -66,7 +71,7 @@ def lockstep(
         commands = action.numpy()
         reward, mask = np.zeros(len(envs), dtype=np.float32), alive.copy()
         observation = observation.copy()
-        for index in np.flatnonzero(alive):
+        for index in np.flatnonzero(alive).tolist():
             outcome = envs[index].step(commands[index])
             observation[index], reward[index] = outcome[0], outcome[1]
             info[index] = numeric_info(outcome[4])

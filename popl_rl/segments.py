@@ -1,9 +1,12 @@
 """Behaviour data: episodes, cut into fixed-length segments, stored once in a replay buffer."""
 
+import json
+import math
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +28,7 @@ __all__ = [
     "random_behaviour",
     "save_tensordict",
     "segment_buffer",
+    "stored_segments",
     "table_behaviour",
 ]
 
@@ -52,7 +56,7 @@ def random_behaviour(action_space: gymnasium.Space[Any]) -> Behaviour:
         count = int(action_space.n)
         return lambda step, generator: torch.randint(count, step.batch_size, generator=generator)
     if isinstance(action_space, gymnasium.spaces.Box) and action_space.is_bounded():
-        low, high = torch.as_tensor(action_space.low), torch.as_tensor(action_space.high)
+        low, high = (torch.as_tensor(end).float() for end in (action_space.low, action_space.high))
         return lambda step, generator: (
             low + (high - low) * torch.rand(*step.batch_size, *low.shape, generator=generator)
         )
@@ -93,18 +97,21 @@ def collect_segments(
     num_segments: int,
     length: int,
     generator: torch.Generator,
+    shares: Mapping[str, float] | None = None,
     max_steps: int = 1000,
     num_envs: int = 64,
     progress: Callable[[int], None] | None = None,
 ) -> TensorDict:
-    """Collect segments of several behaviours in equal shares.
+    """Collect segments of several behaviours.
 
     Args:
         make_env: Builds one environment.
-        behaviours: Behaviours by name; each gives ``num_segments / len(behaviours)`` segments.
+        behaviours: Behaviours by name. One with a ``reset`` method has it called before each batch
+            of episodes.
         num_segments: Segments N in all.
         length: Steps T of a segment.
         generator: Source of seeds and of the behaviours' randomness.
+        shares: Share of the segments that each behaviour gives, summing to 1; equal if None.
         max_steps: Steps after which an episode is cut.
         num_envs: Environments that advance together.
         progress: Called with the number of segments collected so far.
@@ -113,28 +120,41 @@ def collect_segments(
         TensorDict ``[N, T]`` in a random order.
 
     Raises:
-        ValueError: If a count is not positive, or episodes are shorter than ``length``.
+        ValueError: If a count is not positive, there are no behaviours, ``shares`` are no shares of
+            them, or episodes are shorter than ``length``.
     """
-    for name, value in (("num_segments", num_segments), ("length", length)):
+    counts = {
+        "num_segments": num_segments,
+        "length": length,
+        "max_steps": max_steps,
+        "num_envs": num_envs,
+    }
+    for name, value in counts.items():
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
     if not behaviours:
         raise ValueError("behaviours must hold at least one behaviour, got none")
+    given = dict.fromkeys(behaviours, 1 / len(behaviours)) if shares is None else dict(shares)
+    proper = given.keys() <= behaviours.keys() and all(share >= 0 for share in given.values())
+    if not proper or not abs(sum(given.values()) - 1) < 1e-6:
+        raise ValueError(
+            f"shares must be non-negative, sum to 1 and name behaviours out of {list(behaviours)}, "
+            f"got {given}"
+        )
     envs = [make_env() for _ in range(num_envs)]
     collected: list[TensorDict] = []
-    total = 0
+    total, reached = 0, 0.0
     try:
-        for position, (name, behaviour) in enumerate(behaviours.items()):
-            quota = (position + 1) * num_segments // len(behaviours)
+        for name, behaviour in behaviours.items():
+            reached += given.get(name, 0.0)
+            quota = round(reached * num_segments)
             barren = 0
             while total < quota:
                 seeds = torch.randint(2**31, (num_envs,), generator=generator).tolist()
-                episodes = lockstep(
-                    envs,
-                    lambda step, behaviour=behaviour: behaviour(step, generator),
-                    seeds=seeds,
-                    max_steps=max_steps,
-                )
+                if hasattr(behaviour, "reset"):
+                    behaviour.reset()
+                act = partial(_act, behaviour, generator)
+                episodes = lockstep(envs, act, seeds=seeds, max_steps=max_steps)
                 segments = cut_segments(episodes, length)
                 barren = 0 if len(segments) else barren + 1
                 if barren == 5:
@@ -156,6 +176,10 @@ def collect_segments(
     return everything[torch.randperm(total, generator=generator)]
 
 
+def _act(behaviour: Behaviour, generator: torch.Generator, step: TensorDictBase) -> Tensor:
+    return behaviour(step, generator)
+
+
 def segment_buffer(
     segments: TensorDictBase, *, memmap: Path | None = None, batch_size: int = 32
 ) -> TensorDictReplayBuffer:
@@ -174,6 +198,13 @@ def segment_buffer(
     # One item is one segment: the time axis belongs to the leaves, not to the batch.
     buffer.extend(segments.copy().auto_batch_size_(1))
     return buffer
+
+
+def stored_segments(buffer: TensorDictReplayBuffer) -> TensorDict:
+    """All segments of a buffer in the order in which they were stored, ``[N, T]``."""
+    # The buffer adds each item's index, which has no time axis.
+    segments: TensorDict = buffer[:].exclude("index").auto_batch_size_(2)
+    return segments
 
 
 @dataclass(frozen=True)
@@ -246,10 +277,8 @@ def load_tensordict(path: Path, *, required: Mapping[str, int] | None = None) ->
     if not path.is_dir():
         raise FileNotFoundError(f"no saved data at {path}: expected the folder of an earlier run")
     try:
-        for meta in path.rglob("*.memmap"):
-            if meta.stat().st_size == 0:
-                raise ValueError(f"{meta.name} is empty")
-        data: TensorDict = TensorDict.load_memmap(path).clone()
+        _check_whole(path)
+        data: TensorDict = TensorDict.load_memmap(path, allow_pickle=False).clone()
     except Exception as error:
         raise ValueError(
             f"{path} is not readable as saved data ({error}); it is truncated or was written by "
@@ -262,3 +291,21 @@ def load_tensordict(path: Path, *, required: Mapping[str, int] | None = None) ->
                 f"is missing; it has {sorted(map(str, data.keys(True, True)))}"
             )
     return data
+
+
+def _check_whole(path: Path) -> None:
+    """Compare the size of the files with what ``meta.json`` declares, at every level.
+
+    Loading would fill what is missing with zeros, and lengthen the file.
+    """
+    for about in path.rglob("meta.json"):
+        entries = json.loads(about.read_text()).values()
+        declared = sum(
+            math.prod(entry["shape"])
+            * getattr(torch, entry["dtype"].removeprefix("torch.")).itemsize
+            for entry in entries
+            if isinstance(entry, dict) and "dtype" in entry
+        )
+        held = sum(file.stat().st_size for file in about.parent.glob("*.memmap"))
+        if held != declared:
+            raise ValueError(f"{about.parent} holds {held} bytes of tensors instead of {declared}")

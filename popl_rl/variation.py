@@ -6,10 +6,17 @@ import torch
 from torch import Tensor
 
 from popl_rl.comparisons import Comparisons
-from popl_rl.losses import CPLLoss, descend
+from popl_rl.losses import CPLLoss, descend, linear_decay
 from popl_rl.population import Population
 
-__all__ = ["GaussianHead", "GradientCPL", "Variation"]
+__all__ = ["GaussianHead", "GradientCPL", "Variation", "inherit_moments"]
+
+
+def inherit_moments(optimizer: torch.optim.Optimizer, parents: Tensor) -> None:
+    """Give every child of a stacked population its parent's Adam moments."""
+    for state in optimizer.state.values():
+        for moment in ("exp_avg", "exp_avg_sq"):
+            state[moment] = state[moment][parents]
 
 
 class Variation(Protocol):
@@ -111,6 +118,8 @@ class GradientCPL:
     Args:
         loss: CPL loss of the population.
         comparisons: Training preferences.
+        generations: Generations to come; Adam's step size is held for half of them, then falls
+            linearly to zero.
         learning_rate: Adam's step size.
         steps: Gradient steps per generation.
         batch_size: Preferences per member and step.
@@ -122,6 +131,7 @@ class GradientCPL:
         loss: CPLLoss,
         comparisons: Comparisons,
         *,
+        generations: int,
         learning_rate: float = 2e-3,
         steps: int = 10,
         batch_size: int = 128,
@@ -133,13 +143,12 @@ class GradientCPL:
         self.batch_size = batch_size
         self.generator = generator
         self.optimizer = torch.optim.Adam(loss.population.members.parameters(), lr=learning_rate)
+        self.schedule = linear_decay(self.optimizer, generations)
 
     def __call__(self, parents: Tensor, strength: Tensor) -> dict[str, float]:
         """See :class:`Variation`."""
         self.loss.population.replace_(parents)
-        for state in self.optimizer.state.values():
-            for moment in ("exp_avg", "exp_avg_sq"):
-                state[moment] = state[moment][parents]
+        inherit_moments(self.optimizer, parents)
         # A parent that is strong nowhere still needs something to learn from: everything, a bit.
         weight = strength[parents] + 1e-6
         value = descend(
@@ -151,6 +160,7 @@ class GradientCPL:
             weight=weight,
             generator=self.generator,
         )
+        self.schedule.step()
         return {"loss_cpl": value}
 
     def warm_up(self, steps: int) -> None:
@@ -165,9 +175,11 @@ class GradientCPL:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Adam's moments."""
-        return {"optimizer": self.optimizer.state_dict()}
+        """Adam's moments and the learning rate."""
+        # A scheduler's own state holds its lambda; how far it is, is all it needs.
+        return {"optimizer": self.optimizer.state_dict(), "epoch": self.schedule.last_epoch}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore Adam's moments."""
+        """Restore Adam's moments and the learning rate."""
         self.optimizer.load_state_dict(state["optimizer"])
+        self.schedule.last_epoch = int(state["epoch"])

@@ -1,0 +1,160 @@
+"""What came out of a run, as a table in the terminal and as ``report.md``."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+import pandas as pd
+from rich.table import Table
+from rich.text import Text
+from scipy import stats
+
+from popl_rl.plots import METHODS, method_name, require_columns
+
+__all__ = ["markdown", "results_table", "worst_recovery"]
+
+_MEASURES = ("return", "recovery", "success", "accuracy")
+_SHARES = ("success", "accuracy")
+
+_WORDS = {
+    "group": "raters who want the same. No method but the oracle is told who belongs to which.",
+    "POPL (catered)": "the policy that the policy set offers to a new rater of the group after a "
+    "few answers.",
+    "oracle": "trained on the answers of this group alone, so it knows what POPL has to find out.",
+    "return": "sum over an episode of what the group's raters value, averaged over episodes.",
+    "recovery": "(return − random) / (oracle's return − random): 1 is as good as the oracle, 0 as "
+    "bad as random actions. The worst group's recovery is what counts: a method that serves the "
+    "majority alone has a low one.",
+    "success": "share of episodes that fulfil the task, whatever the group wants besides.",
+    "accuracy": "share of pairs of segments, not used in training, that the policy ranks as the "
+    "group does; 50 % is guessing.",
+}
+
+
+def results_table(results: pd.DataFrame) -> Table:
+    """Lay out results for a terminal: a row for each method and group.
+
+    Args:
+        results: Tidy rows ``method, group, measure, value``. Several rows of a method, group and
+            measure, such as seeds, are shown as their mean and its 95 % interval.
+
+    Returns:
+        Columns return, recovery, success and accuracy, with a dash for what was not measured.
+
+    Raises:
+        ValueError: If a column is missing.
+    """
+    table = Table("method", "raters who want", title="How well is each group served?")
+    for measure in _MEASURES:
+        table.add_column(measure, justify="right")
+    previous = None
+    for method, group, *cells in _rows(results):
+        if previous not in (None, method):
+            table.add_section()
+        table.add_row(method if method != previous else "", Text(group), *cells)
+        previous = method
+    return table
+
+
+def worst_recovery(results: pd.DataFrame) -> dict[str, float]:
+    """Recovery of the group that each method serves worst.
+
+    Args:
+        results: Tidy rows ``method, group, measure, value``, averaged over repeated rows.
+
+    Returns:
+        Method -> recovery, without methods whose recovery was not measured in every group.
+    """
+    require_columns(results, ["method", "group", "measure", "value"])
+    rows = results[results["measure"] == "recovery"]
+    worst = {}
+    for method in _methods(rows):
+        by_group = rows[rows["method"] == method].groupby("group")["value"].mean()
+        if by_group.notna().all():
+            worst[method] = float(by_group.min())
+    return worst
+
+
+def markdown(
+    results: pd.DataFrame, *, title: str, about: Mapping[str, Any], figures: Sequence[Path]
+) -> str:
+    """Write the text of a report.
+
+    Args:
+        results: Tidy rows ``method, group, measure, value``.
+        title: Heading.
+        about: What was run, such as environment, groups and seed.
+        figures: Pictures, relative to the folder of the report.
+
+    Returns:
+        Markdown: what was run, the results, the pictures, and what the words mean.
+
+    Raises:
+        ValueError: If a column is missing or a path in ``figures`` is absolute.
+    """
+    absolute = [str(figure) for figure in figures if figure.is_absolute()]
+    if absolute:
+        raise ValueError(
+            f"figures must be relative to the report's folder, so that it can be moved, got "
+            f"{absolute}; use figure.relative_to(run_dir)"
+        )
+    worst = [
+        f"{method_name(method)} **{value:z.2f}**"
+        for method, value in worst_recovery(results).items()
+        if method not in ("oracle", "random")  # 1 and 0 by definition
+    ]
+    blocks = [f"# {title}"]
+    if about:
+        blocks.append(_table(["", ""], [[key, value] for key, value in about.items()]))
+    blocks.append("## How well is each group served?")
+    if worst:
+        blocks.append(f"Recovery of the worst-served group: {', '.join(worst)}.")
+    head = ["method", "raters who want", *_MEASURES]
+    blocks.append(_table(head, _rows(results), right=len(_MEASURES)))
+    blocks.append("Every number measured is in `results.csv`.")
+    for figure in figures:
+        name = figure.stem.replace("_", " ")
+        blocks.append(f"![{name}]({quote(figure.as_posix())})")
+    blocks.append("## Words")
+    blocks.append("\n".join(f"- **{word}**: {meaning}" for word, meaning in _WORDS.items()))
+    return "\n\n".join(blocks) + "\n"
+
+
+def _methods(results: pd.DataFrame) -> list[str]:
+    found = list(results["method"].unique())
+    return [m for m in METHODS if m in found] + [m for m in found if m not in METHODS]
+
+
+def _rows(results: pd.DataFrame) -> Iterator[list[str]]:
+    require_columns(results, ["method", "group", "measure", "value"])
+    for method in _methods(results):
+        of_method = results[results["method"] == method]
+        for group in of_method["group"].unique():
+            of_group = of_method[of_method["group"] == group]
+            values = {name: rows["value"] for name, rows in of_group.groupby("measure")}
+            cells = [_cell(name, values.get(name, pd.Series(dtype=float))) for name in _MEASURES]
+            yield [method_name(method), str(group), *cells]
+
+
+def _cell(measure: str, values: pd.Series) -> str:
+    numbers = values.dropna().to_numpy(dtype=float)
+    if not len(numbers):
+        return "–"
+    scale, decimals, unit = (100, 0, " %") if measure in _SHARES else (1, 2, "")
+    text = f"{scale * numbers.mean():z.{decimals}f}"
+    if len(numbers) > 1:
+        error = numbers.std(ddof=1) / np.sqrt(len(numbers))
+        half = stats.t.ppf(0.975, len(numbers) - 1) * error
+        text += f" ± {scale * half:.{decimals}f}"
+    return text.replace("-", "−") + unit
+
+
+def _table(head: Sequence[str], rows: Iterator[list[str]] | list[list[Any]], right: int = 0) -> str:
+    """Lay out a Markdown table whose last ``right`` columns are numbers."""
+    rule = ["---"] * (len(head) - right) + ["---:"] * right
+    lines = [head, rule, *rows]
+    return "\n".join(
+        "| " + " | ".join(str(cell).replace("|", "\\|") for cell in line) + " |" for line in lines
+    )

@@ -1,0 +1,354 @@
+"""POPL without rater ids: lexicase selection among teams of policies.
+
+When nobody knows which preferences came from one person, a single preference says little about
+which policy it speaks for, and selecting single policies on single preferences keeps specialists
+that win a case here and there. So the individual here is a *team*, a small mixture of policies
+that together should explain whatever is preferred:
+
+    p(preference) = sum_k share_k sigmoid(Delta_k)
+
+Members of a team divide the preferences among themselves by responsibility (the E-step of EM; Dempster,
+Laird and Rubin, 1977, as in MaxMin-RLHF, Chakraborty et al., 2024, but over policies and without being told the number of groups). Teams
+are selected by lexicase on small bundles of *held-out* preferences, and the smallest team that is
+as good as the best is the result, so neither group labels nor the number of groups is needed.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F  # noqa: N812 - the name everyone knows
+from torch import Tensor
+
+from popl_rl.comparisons import Comparisons
+from popl_rl.lexicase import lexicase_report
+from popl_rl.losses import CPLLoss, linear_decay
+from popl_rl.policies import PolicySpec
+from popl_rl.policy_set import PolicySet
+from popl_rl.popl import mad, margins
+from popl_rl.population import Population
+from popl_rl.segments import SegmentBank
+from popl_rl.variation import inherit_moments
+
+__all__ = ["TeamPOPL", "TeamSettings"]
+
+_OUTLIERS = 0.05  # a held-out preference counts as noise with this chance at either end
+
+
+@dataclass(frozen=True)
+class TeamSettings:
+    """Settings of :class:`TeamPOPL`.
+
+    Attributes:
+        teams: Teams in the population.
+        sizes: Sizes of the first teams, in turn.
+        generations: Generations to come.
+        steps: Gradient steps per generation.
+        batch_size: Preferences per step, the same for all teams.
+        learning_rate: Of Adam.
+        weight_decay: Decoupled (AdamW); without it members explain what they should not.
+        alpha: Scale of the scores.
+        conservatism: Lambda of the CPL loss.
+        discount: Per-step discount of the scores.
+        warm_up: Pooled CPL steps that all policies start from.
+        noise: Noise on the copies of the pooled policy, relative to each layer's spread.
+        held_out: Share of the preferences that only selection sees.
+        bundle: Held-out preferences per lexicase case.
+        first_selection: Generation after which selection begins.
+        exchange: Chance that a further child swaps a member with another selected team.
+        removal: Chance that a further child loses a member.
+        polish_steps: Steps of the final, cross-fitted training of the chosen team.
+        polish_alpha: Scale of the scores in that training.
+        folds: Folds of that training.
+    """
+
+    teams: int = 12
+    sizes: tuple[int, ...] = (2, 3, 4)
+    generations: int = 10
+    steps: int = 50
+    batch_size: int = 1000
+    learning_rate: float = 2e-3
+    weight_decay: float = 0.5
+    alpha: float = 0.5
+    conservatism: float = 0.9
+    discount: float = 1.0
+    warm_up: int = 200
+    noise: float = 0.1
+    held_out: float = 0.2
+    bundle: int = 20
+    first_selection: int = 5
+    exchange: float = 0.15
+    removal: float = 0.15
+    polish_steps: int = 1000
+    polish_alpha: float = 0.25
+    folds: int = 4
+
+
+class TeamPOPL:
+    """Evolves teams of policies; one generation is gradient steps, lexicase, exchange.
+
+    Args:
+        spec: Sizes of the policies.
+        bank: Segments that the comparisons refer to.
+        comparisons: M strict preferences; their cases are not looked at.
+        settings: See :class:`TeamSettings`.
+        generator: Source of all randomness.
+
+    Attributes:
+        generation: Generations done so far.
+        population: ``teams * max(sizes)`` policies, team after team.
+        active: Which of a team's places are taken, ``[teams, max(sizes)]`` bool.
+        share: What share of the preferences each member speaks for, ``[teams, max(sizes)]``.
+    """
+
+    def __init__(
+        self,
+        spec: PolicySpec,
+        bank: SegmentBank,
+        comparisons: Comparisons,
+        *,
+        settings: TeamSettings,
+        generator: torch.Generator,
+    ) -> None:
+        self.spec, self.bank, self.settings = spec, bank, settings
+        self.comparisons, self.generator = comparisons, generator
+        self.generation = 0
+        self.alpha, self.discount = settings.alpha, settings.discount
+        device = bank.row.device
+        places = max(settings.sizes)
+        order = self._permutation(len(comparisons))
+        cut = int(settings.held_out * len(comparisons))
+        if cut < settings.bundle:
+            raise ValueError(
+                f"preferences must be enough to hold {settings.bundle} out of "
+                f"{settings.held_out:.0%}, got {len(comparisons)}; collect more answers"
+            )
+        self.held, self.train = comparisons.rows(order[:cut]), comparisons.rows(order[cut:])
+        sizes = [settings.sizes[team % len(settings.sizes)] for team in range(settings.teams)]
+        taken = torch.tensor(sizes, device=device).unsqueeze(1)
+        self.active = torch.arange(places, device=device) < taken
+        self.share = self.active / taken
+        self.population = self._copies_of_pooled(settings.teams * places)
+        self.loss, self.optimizer = self._trainer(self.population, settings.alpha)
+
+    def step(self) -> dict[str, float]:
+        """Run one generation.
+
+        Returns:
+            Scalars to log: ``worst_rater_accuracy`` (share of held-out preferences that some
+            member of the best team passes), ``held_out_likelihood`` of the best team (mean log),
+            ``selection_depth``, ``distinct`` teams, ``effective_parents``, ``team_size`` of the
+            best team and ``loss``.
+        """
+        settings = self.settings
+        value = torch.tensor(0.0)
+        for _ in range(settings.steps):
+            log_odds = F.logsigmoid(self._batch_margins(self.loss, self._draw(self.train)))
+            value = -self._explain(log_odds).mean(1).sum()
+            _descend(value, self.optimizer)
+        self.generation += 1
+        self._update_shares()
+        held = margins(
+            self.population, self.bank, self.held, alpha=self.alpha, discount=self.discount
+        )
+        likelihood = self._explain(F.logsigmoid(held)).exp()
+        robust = (_OUTLIERS + (1 - 2 * _OUTLIERS) * likelihood).log()
+        best = int(robust.mean(1).argmax())
+        passed = (held.unflatten(0, self.active.shape) > 0) & self.active.unsqueeze(-1)
+        metrics = {
+            "worst_rater_accuracy": float(passed[best].any(0).float().mean()),
+            "held_out_likelihood": float(robust[best].mean()),
+            "selection_depth": 0.0,
+            "distinct": float(settings.teams),
+            "effective_parents": float(settings.teams),
+            "team_size": float(self.active[best].sum()),
+            "loss": float(value.detach()) / settings.teams,
+        }
+        if settings.first_selection <= self.generation < settings.generations:
+            cases = self._bundles(robust)
+            report = lexicase_report(
+                cases, settings.teams, epsilon=mad(cases), generator=self.generator
+            )
+            self._replace(report.parents)
+            metrics["selection_depth"] = float(report.depth.float().mean())
+            metrics["distinct"] = float(report.distinct)
+            metrics["effective_parents"] = report.effective
+        return metrics
+
+    def policies(self) -> PolicySet:
+        """Choose the smallest team as good as the best, and polish it."""
+        held = margins(
+            self.population, self.bank, self.held, alpha=self.alpha, discount=self.discount
+        )
+        likelihood = self._explain(F.logsigmoid(held)).exp()
+        robust = (_OUTLIERS + (1 - 2 * _OUTLIERS) * likelihood).log()
+        behind = robust[robust.mean(1).argmax()] - robust
+        # One-standard-error rule: a bigger team has to earn its members.
+        error = behind.std(1) / behind.shape[1] ** 0.5
+        size = self.active.sum(1)
+        good = behind.mean(1) <= error
+        smallest = good & (size == size[good].min())
+        team = int(torch.where(smallest, robust.mean(1), -torch.inf).argmax())
+        member = self.active[team].nonzero().squeeze(-1) + team * self.active.shape[1]
+        share = self.share[team][self.active[team]]
+        return self._polish(self.population.subset(member), share)
+
+    def _polish(self, team: Population, share: Tensor) -> PolicySet:
+        """Train a team on, with responsibilities that nobody gave to their own training data.
+
+        ``folds + 1`` copies of the team train side by side. Copy f leaves fold f out and tells
+        whom the preferences of fold f belong to; the last copy trains on everything. Without this
+        every member would confirm what it has learnt by heart.
+        """
+        settings, everything = self.settings, self.comparisons
+        count, size = len(everything), len(team)
+        fold = self._permutation(count) % settings.folds
+        row = torch.arange(count, device=fold.device)
+        copies = team.subset(list(range(size)) * (settings.folds + 1))
+        loss, optimizer = self._trainer(copies, settings.polish_alpha, weight_decay=0.0)
+        block = 50
+        schedule = linear_decay(optimizer, -(-settings.polish_steps // block))
+        use = torch.ones(settings.folds + 1, count, device=fold.device)
+        use[fold, row] = 0.0
+        use = use * count / use.sum(1, keepdim=True)
+        log_share = share.clamp(min=1e-3).log().unsqueeze(-1)
+        for _ in range(-(-settings.polish_steps // block)):
+            margin = margins(
+                copies, self.bank, everything, alpha=settings.polish_alpha, discount=self.discount
+            )
+            log_odds = F.logsigmoid(margin).unflatten(0, (settings.folds + 1, size))
+            responsibility = (log_odds + log_share).softmax(1)[fold, :, row].T
+            for _ in range(block):
+                index = self._draw(everything)
+                contrast = self._batch_margins(loss, index, everything)
+                weight = (use[:, None, index] * responsibility[:, index]).flatten(0, 1)
+                _descend((F.softplus(-contrast) * weight).mean(1).sum(), optimizer)
+            schedule.step()
+        polished = copies.subset(list(range(settings.folds * size, len(copies))))
+        return PolicySet(polished, alpha=settings.polish_alpha, discount=self.discount)
+
+    def _explain(self, log_odds: Tensor) -> Tensor:
+        """Log-likelihood of preferences under each team, ``[N, B] -> [teams, B]``."""
+        log_share = self.share.clamp(min=1e-3).log()
+        log_share = log_share.masked_fill(~self.active, -torch.inf).unsqueeze(-1)
+        return (log_odds.unflatten(0, self.active.shape) + log_share).logsumexp(1)
+
+    @torch.no_grad()
+    def _update_shares(self) -> None:
+        margin = margins(
+            self.population, self.bank, self.train, alpha=self.alpha, discount=self.discount
+        )
+        log_odds = F.logsigmoid(margin).unflatten(0, self.active.shape)
+        log_share = self.share.clamp(min=1e-3).log().masked_fill(~self.active, -torch.inf)
+        responsibility = (log_odds + log_share.unsqueeze(-1)).softmax(1)
+        self.share = responsibility.mean(2)
+
+    def _bundles(self, values: Tensor) -> Tensor:
+        """Mean of held-out values over random bundles, ``[teams, cases]``."""
+        cases = values.shape[1] // self.settings.bundle
+        chosen = self._permutation(values.shape[1])[: cases * self.settings.bundle]
+        return values[:, chosen].unflatten(1, (cases, -1)).mean(2)
+
+    def _replace(self, parents: Tensor) -> None:
+        """The first child of a parent is its copy; further ones exchange and lose members."""
+        places = self.active.shape[1]
+        source = parents.unsqueeze(1) * places + torch.arange(places, device=parents.device)
+        active, share = self.active[parents].clone(), self.share[parents].clone()
+        seen: set[int] = set()
+        for child, parent in enumerate(parents.tolist()):
+            if parent in seen:
+                mine = active[child].nonzero().squeeze(-1)
+                if self._chance() < self.settings.exchange:
+                    other = int(parents[self._pick(len(parents))])
+                    theirs = self.active[other].nonzero().squeeze(-1)
+                    place = mine[self._pick(len(mine))]
+                    source[child, place] = other * places + theirs[self._pick(len(theirs))]
+                if len(mine) > 1 and self._chance() < self.settings.removal:
+                    active[child, mine[self._pick(len(mine))]] = False
+            seen.add(parent)
+        share = share * active
+        self.active, self.share = active, share / share.sum(1, keepdim=True)
+        self.population.replace_(source.flatten())
+        inherit_moments(self.optimizer, source.flatten())
+
+    def _copies_of_pooled(self, count: int) -> Population:
+        """Noisy copies of one policy trained on everything."""
+        settings = self.settings
+        single = Population.create(self.spec, 1, generator=self.generator)
+        single = single.to(self.bank.row.device)
+        loss, optimizer = self._trainer(single, settings.alpha)
+        for _ in range(settings.warm_up):
+            contrast = self._batch_margins(loss, self._draw(self.train))
+            _descend(F.softplus(-contrast).mean(), optimizer)
+        population = single.subset([0] * count)
+        for name, value in population.members.data.items(True, True):
+            if name[-1] == "weight":
+                noise = torch.randn(
+                    value.shape, generator=self.generator, device=self.generator.device
+                )
+                value.add_(settings.noise * value[0].std() * noise)
+        return population
+
+    def _trainer(
+        self, population: Population, alpha: float, weight_decay: float | None = None
+    ) -> tuple[CPLLoss, torch.optim.AdamW]:
+        settings = self.settings
+        loss = CPLLoss(
+            population,
+            self.bank,
+            alpha=alpha,
+            conservatism=settings.conservatism,
+            discount=settings.discount,
+        )
+        decay = settings.weight_decay if weight_decay is None else weight_decay
+        optimizer = torch.optim.AdamW(
+            population.members.parameters(), lr=settings.learning_rate, weight_decay=decay
+        )
+        return loss, optimizer
+
+    def _batch_margins(
+        self, loss: CPLLoss, index: Tensor, comparisons: Comparisons | None = None
+    ) -> Tensor:
+        """Conservative margins of every member on one shared batch, ``[N, B]``."""
+        source = self.train if comparisons is None else comparisons
+        segment = torch.cat([source.preferred[index], source.other[index]])
+        preferred, other = loss.scores(segment.expand(len(loss.population), -1)).chunk(2, dim=1)
+        return preferred - self.settings.conservatism * other
+
+    def _draw(self, comparisons: Comparisons) -> Tensor:
+        shape, device = (self.settings.batch_size,), comparisons.preferred.device
+        return torch.randint(len(comparisons), shape, generator=self.generator, device=device)
+
+    def _permutation(self, count: int) -> Tensor:
+        return torch.randperm(count, generator=self.generator, device=self.generator.device)
+
+    def _pick(self, count: int) -> int:
+        return int(torch.randint(count, (), generator=self.generator, device=self.generator.device))
+
+    def _chance(self) -> float:
+        return float(torch.rand((), generator=self.generator, device=self.generator.device))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the next generation depends on."""
+        return {
+            "generation": self.generation,
+            "members": self.population.members.data.clone().to_dict(),
+            "active": self.active.clone(),
+            "share": self.share.clone(),
+            "optimizer": self.optimizer.state_dict(),
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from :meth:`state_dict`, bit for bit."""
+        self.generation = int(state["generation"])
+        self.population.members.data.update_(state["members"])
+        self.active, self.share = state["active"].clone(), state["share"].clone()
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.generator.set_state(state["generator"].cpu())
+
+
+def _descend(loss: Tensor, optimizer: torch.optim.Optimizer) -> None:
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()  # type: ignore[no-untyped-call]
+    optimizer.step()
