@@ -52,7 +52,7 @@ class TwoDoors(MiniGridEnv):
         size: Cells along each side, outer walls included; at least 7.
         doors: Number of doors, 2 to 4.
         start: "near" starts in a uniformly random cell and direction left of the wall; "anywhere"
-            in any free cell but the goal.
+            in any free cell but the goal; "mixed" does either with equal chance.
         max_steps: Steps after which an episode is truncated.
         render_mode: None, "rgb_array" or "human".
 
@@ -73,13 +73,13 @@ class TwoDoors(MiniGridEnv):
         *,
         size: int = 9,
         doors: int = 2,
-        start: Literal["near", "anywhere"] = "near",
+        start: Literal["near", "anywhere", "mixed"] = "near",
         max_steps: int = 60,
         render_mode: str | None = None,
     ) -> None:
         rows = _checked_door_rows(size, doors)
-        if start not in ("near", "anywhere"):
-            raise ValueError(f"start must be 'near' or 'anywhere', got {start!r}.")
+        if start not in ("near", "anywhere", "mixed"):
+            raise ValueError(f"start must be 'near', 'anywhere' or 'mixed', got {start!r}.")
         if max_steps < 1:
             raise ValueError(f"max_steps must be at least 1, got {max_steps}.")
         super().__init__(
@@ -104,8 +104,14 @@ class TwoDoors(MiniGridEnv):
         self.states = [(x, y, direction) for x, y in free for direction in range(4)]
         self.cells = torch.tensor([state[:2] for state in self.states])
         self._index = {state: index for index, state in enumerate(self.states)}
-        first = self.near_cells if start == "near" else free
-        self._first = [s for s in self.states if s[:2] in first and s[:2] != self.goal_cell]
+        near = [s for s in self.states if s[:2] in self.near_cells]
+        anywhere = [s for s in self.states if s[:2] != self.goal_cell]
+        # Entries may repeat: a start is a uniform draw from this list.
+        self._first = {
+            "near": near,
+            "anywhere": anywhere,
+            "mixed": near * len(anywhere) + anywhere * len(near),
+        }[start]
         self.action_space = gymnasium.spaces.Discrete(3)
         self.observation_space = gymnasium.spaces.Box(
             0.0, 1.0, (2 * (size - 2) + 4,), dtype=np.float32
@@ -179,8 +185,8 @@ class TwoDoors(MiniGridEnv):
             },
             batch_size=shape,
         )
-        start = torch.zeros(num_states)
-        start[[self._index[state] for state in self._first]] = 1 / len(self._first)
+        first = torch.tensor([self._index[state] for state in self._first])
+        start = first.bincount(minlength=num_states) / len(first)
         return Table(steps, next_state, goal, start)
 
     def behaviours(self) -> dict[str, "Tensor | Explorer"]:
@@ -291,7 +297,7 @@ def two_doors(
     *,
     size: int = 9,
     doors: int = 2,
-    start: Literal["near", "anywhere"] = "near",
+    start: Literal["near", "anywhere", "mixed"] = "near",
     max_steps: int = 60,
     render_mode: str | None = None,
 ) -> gymnasium.Env[Any, Any]:

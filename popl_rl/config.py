@@ -62,7 +62,7 @@ class DataConfig:
     """The segments that raters see."""
 
     segments: int = 4000  # segments to collect
-    length: int = 16  # steps of a segment
+    length: int = 12  # steps of a segment
     memmap: str | None = None  # folder for memory-mapped storage; in memory if null
     load: str | None = None  # folder 'data' of an earlier run: its segments and preferences
     save: bool = True  # keep segments and preferences in the run folder
@@ -74,7 +74,7 @@ class MethodConfig:
 
     name: str = "popl"
     cases: str = "rater"  # what lexicase filters on: rater (needs rater ids) or preference
-    variation: str = "gradient"  # gradient (CPL steps with competition) or gaussian (published)
+    variation: str = "auto"  # gradient, gaussian (published), teams; auto goes by the cases
     evolve: str = "all"  # all: whole networks; head: last layers on a shared trunk
     members: int = 32  # policies in the population
     generations: int = 100
@@ -87,6 +87,8 @@ class MethodConfig:
     steps: int = 10  # CPL steps of each child (gradient)
     batch_size: int = 128  # preferences per CPL step and member (gradient)
     learning_rate: float = 2e-3  # of Adam (gradient)
+    teams: int = 12  # teams of policies in the population (teams)
+    team_generations: int = 10  # generations of 50 CPL steps (teams)
     mutation_std: float = 0.1  # standard deviation of a mutation (gaussian)
 
 
@@ -176,7 +178,8 @@ def validate(config: Config) -> None:
     at_least_one(data, "data", "segments", "length")
     at_least_one(evaluation, "evaluation", "episodes", "new_raters", "answers", "pairs")
     at_least_one(evaluation, "evaluation", "baseline_steps", "baseline_batch_size")
-    at_least_one(method, "method", "members", "generations", "steps", "batch_size")
+    at_least_one(method, "method", "generations", "steps", "batch_size")
+    at_least_one(method, "method", "teams", "team_generations")
     expect(data.segments >= 2, "data.segments", "at least 2, to compare", data.segments)
     expect(bool(raters.groups), "raters.groups", "one or more rater references", raters.groups)
     repeated = len(set(raters.groups)) < len(raters.groups)
@@ -194,8 +197,8 @@ def validate(config: Config) -> None:
     expect(0 < response.myopia <= 1, "raters.response.myopia", "in (0, 1]", response.myopia)
     expect(response.tie >= 0, "raters.response.tie", "at least 0", response.tie)
     expect(method.cases in ("rater", "preference"), "method.cases", "rater or preference", method.cases)
-    kinds = ("gradient", "gaussian")
-    expect(method.variation in kinds, "method.variation", "gradient or gaussian", method.variation)
+    kinds = ("auto", "gradient", "gaussian", "teams")
+    expect(method.variation in kinds, "method.variation", ", ".join(kinds), method.variation)
     expect(method.evolve in ("all", "head"), "method.evolve", "all or head", method.evolve)
     if method.variation == "gaussian":
         expect(method.evolve == "head", "method.evolve", "head for Gaussian variation", method.evolve)

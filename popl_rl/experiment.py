@@ -19,6 +19,7 @@ from popl_rl.keys import ACTION, INFO, OBSERVATION
 from popl_rl.losses import CPLLoss
 from popl_rl.planning import Table
 from popl_rl.policies import PolicySpec
+from popl_rl.policy_set import PolicySet
 from popl_rl.popl import POPL
 from popl_rl.population import Population
 from popl_rl.preferences import collect_preferences, load_preferences
@@ -35,9 +36,22 @@ from popl_rl.segments import (
     stored_segments,
     table_behaviour,
 )
+from popl_rl.teams import TeamPOPL, TeamSettings
 from popl_rl.variation import GaussianHead, GradientCPL
 
-__all__ = ["Data", "World", "build_groups", "build_popl", "build_world", "make_data", "stream"]
+__all__ = [
+    "Data",
+    "World",
+    "behaviour_shares",
+    "build_groups",
+    "build_popl",
+    "build_world",
+    "final_policies",
+    "generations_of",
+    "make_data",
+    "stream",
+    "variation_of",
+]
 
 MakeEnv = Callable[[], gymnasium.Env[Any, Any]]
 
@@ -262,12 +276,25 @@ def build_popl(
     comparisons: Comparisons,
     *,
     generator: torch.Generator,
-) -> POPL:
-    """Build the trainer's inner loop; a warmed-up population, nothing selected yet."""
+) -> POPL | TeamPOPL:
+    """Build the trainer's inner loop; a warmed-up population, nothing selected yet.
+
+    ``variation: auto`` means gradient variation for rater cases and teams for preference cases.
+    """
+    if variation_of(config) == "teams":
+        settings = TeamSettings(
+            teams=config.teams,
+            generations=config.team_generations,
+            alpha=config.alpha,
+            conservatism=config.conservatism,
+            discount=config.discount,
+            learning_rate=config.learning_rate,
+        )
+        return TeamPOPL(spec, bank, comparisons, settings=settings, generator=generator)
     population = Population.create(
         spec, config.members, evolve=cast("Any", config.evolve), generator=generator
     ).to(bank.row.device)
-    if config.variation == "gaussian":
+    if variation_of(config) == "gaussian":
         variation: GaussianHead | GradientCPL = GaussianHead(
             population, std=config.mutation_std, generator=generator
         )
@@ -298,4 +325,25 @@ def build_popl(
         discount=config.discount,
         epsilon=cast("Any", parse_epsilon(config.epsilon)),
         generator=generator,
+    )
+
+
+def variation_of(config: MethodConfig) -> str:
+    """The kind of variation that ``auto`` stands for, or the one that was asked for."""
+    if config.variation != "auto":
+        return config.variation
+    return "gradient" if config.cases == "rater" else "teams"
+
+
+def generations_of(config: MethodConfig) -> int:
+    """Generations that a run of this method takes; those of teams are longer and fewer."""
+    return config.team_generations if variation_of(config) == "teams" else config.generations
+
+
+def final_policies(popl: POPL | TeamPOPL) -> PolicySet:
+    """The policy set that a finished run has found."""
+    if isinstance(popl, TeamPOPL):
+        return popl.policies()
+    return PolicySet.distinct(
+        popl.population, popl.bank, popl.comparisons, alpha=popl.alpha, discount=popl.discount
     )

@@ -76,7 +76,11 @@ def draw(
             accuracy,
             snapshots.generation.tolist(),
             names,
-            catered={name: policies.origin[index] for name, index in board.catered.items()},
+            catered={
+                name: policies.origin[index]
+                for name, index in board.catered.items()
+                if policies.origin
+            },
             pooled=pooled,
             oracle=oracle,
         )

@@ -48,7 +48,7 @@ class PolicySet:
         discount: Per-step discount of their scores.
 
     Attributes:
-        origin: Member of the trained population that each policy was.
+        origin: Member of the trained population that each policy is; empty if it is none of them.
 
     Example:
         >>> policies = PolicySet.load("runs/mine/policies")  # doctest: +SKIP

@@ -114,6 +114,7 @@ class TeamPOPL:
         self.comparisons, self.generator = comparisons, generator
         self.generation = 0
         self.alpha, self.discount = settings.alpha, settings.discount
+        self._counts = _visit_counts(bank, spec, settings.discount)
         device = bank.row.device
         places = max(settings.sizes)
         order = self._permutation(len(comparisons))
@@ -225,7 +226,9 @@ class TeamPOPL:
                 _descend((F.softplus(-contrast) * weight).mean(1).sum(), optimizer)
             schedule.step()
         polished = copies.subset(list(range(settings.folds * size, len(copies))))
-        return PolicySet(polished, alpha=settings.polish_alpha, discount=self.discount)
+        policies = PolicySet(polished, alpha=settings.polish_alpha, discount=self.discount)
+        policies.origin = []  # trained on, they are no longer members of the population
+        return policies
 
     def _explain(self, log_odds: Tensor) -> Tensor:
         """Log-likelihood of preferences under each team, ``[N, B] -> [teams, B]``."""
@@ -311,9 +314,15 @@ class TeamPOPL:
     ) -> Tensor:
         """Conservative margins of every member on one shared batch, ``[N, B]``."""
         source = self.train if comparisons is None else comparisons
-        segment = torch.cat([source.preferred[index], source.other[index]])
-        preferred, other = loss.scores(segment.expand(len(loss.population), -1)).chunk(2, dim=1)
-        return preferred - self.settings.conservatism * other
+        preferred, other = source.preferred[index], source.other[index]
+        if self._counts is None:
+            segment = torch.cat([preferred, other]).expand(len(loss.population), -1)
+            better, worse = loss.scores(segment).chunk(2, dim=1)
+            return better - self.settings.conservatism * worse
+        # All members see the same batch of few distinct observations: one matrix product.
+        table = loss.population(self.bank.observation).log_softmax(-1).flatten(1)
+        contrast = self._counts[preferred] - self.settings.conservatism * self._counts[other]
+        return loss.alpha * table @ contrast.T
 
     def _draw(self, comparisons: Comparisons) -> Tensor:
         shape, device = (self.settings.batch_size,), comparisons.preferred.device
@@ -346,6 +355,17 @@ class TeamPOPL:
         self.active, self.share = state["active"].clone(), state["share"].clone()
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"].cpu())
+
+
+def _visit_counts(bank: SegmentBank, spec: PolicySpec, discount: float) -> Tensor | None:
+    """Discounted visits of each segment to each (observation, action), ``[N, U * K]``."""
+    if not (bank.is_shared and spec.discrete):
+        return None
+    cells = len(bank.observation) * spec.action_dim
+    steps = torch.arange(bank.row.shape[1], device=bank.row.device)
+    weight = (discount**steps).float().expand(bank.row.shape)
+    counts = torch.zeros(len(bank), cells, device=bank.row.device)
+    return counts.scatter_add(1, bank.row * spec.action_dim + bank.action, weight)
 
 
 def _descend(loss: Tensor, optimizer: torch.optim.Optimizer) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chisquare
 from torch import Tensor
@@ -28,9 +28,9 @@ def test_random_sample_is_of_distinct_cases(num_cases, data, seed):
 
 def test_every_pair_of_cases_is_sampled_equally_often():
     draws = generator()
-    pairs = [tuple(sorted(downsample(5, 2, generator=draws).tolist())) for _ in range(2000)]
+    pairs = [tuple(sorted(downsample(5, 2, generator=draws).tolist())) for _ in range(1000)]
     counts = [pairs.count((a, b)) for a in range(5) for b in range(a + 1, 5)]
-    assert chisquare(counts).pvalue > 1e-3
+    assert chisquare(counts).pvalue > 1e-4
 
 
 def test_seed_decides_the_sample():
@@ -50,6 +50,7 @@ matrices = st.integers(1, 40).flatmap(
 )
 
 
+@settings(max_examples=40)
 @given(rows=matrices, data=st.data(), seed=st.integers(0, 99))
 def test_each_case_kept_is_farthest_from_those_before_it(rows, data, seed):
     passes = torch.tensor(rows)
@@ -83,9 +84,9 @@ def test_ties_are_broken_at_random():
     # After case 0 the four others are equally far, from it and from each other.
     passes = torch.eye(5).bool()
     draws = generator()
-    kept = [tuple(informed_downsample(passes, 2, generator=draws).tolist()) for _ in range(2000)]
+    kept = [tuple(informed_downsample(passes, 2, generator=draws).tolist()) for _ in range(1000)]
     counts = [kept.count((a, b)) for a in range(5) for b in range(5) if a != b]
-    assert chisquare(counts).pvalue > 1e-3
+    assert chisquare(counts).pvalue > 1e-4
 
 
 def test_a_rare_case_stays_in_where_chance_drops_it():
@@ -130,7 +131,7 @@ def test_sample_of_members_limits_what_is_seen():
             TypeError,
             "num_kept must be an int, got float",
         ),
-        (lambda g: downsample(5, 2, generator=3), TypeError, "generator must be a torch.Generator"),
+        (lambda _: downsample(5, 2, generator=3), TypeError, "generator must be a torch.Generator"),
         (
             lambda g: informed_downsample(torch.rand(3, 3), 2, generator=g),
             TypeError,

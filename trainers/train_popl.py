@@ -25,7 +25,15 @@ from rich.console import Console
 from popl_rl.baselines import group_weights, train_cpl
 from popl_rl.comparisons import Comparisons
 from popl_rl.config import Config, validate
-from popl_rl.experiment import build_groups, build_popl, build_world, make_data, stream
+from popl_rl.experiment import (
+    build_groups,
+    build_popl,
+    build_world,
+    final_policies,
+    generations_of,
+    make_data,
+    stream,
+)
 from popl_rl.keys import ANSWER, GROUP, Answer
 from popl_rl.loggers import make_logger
 from popl_rl.pictures import draw
@@ -107,7 +115,7 @@ def run(config: Config) -> Result:
     )
     metrics = MetricsWriter(run_dir / "metrics.csv")
     history = MetricsWriter(run_dir / "history.csv")
-    generations = config.method.generations
+    generations = generations_of(config.method)
     with (
         make_logger(
             config.logger.name, run_dir, project=config.logger.project, config=settings
@@ -136,9 +144,7 @@ def run(config: Config) -> Result:
         metrics.truncate_to(done)
         history.truncate_to(done)
         trainer.train()
-        policies = PolicySet.distinct(
-            popl.population, bank, comparisons, alpha=popl.alpha, discount=popl.discount
-        )
+        policies = final_policies(popl)
         _save_anew(policies, run_dir / "policies")
 
         # 4. What the set is compared with, on the same data.
