@@ -1,0 +1,1 @@
+"""Hydra configuration: YAML that differs from the defaults in popl_rl/config.py."""

@@ -10,6 +10,7 @@ from torch import Tensor
 # Work is measured in nanoseconds as seen on one CPU core. The figures decide only when a round
 # stops drawing cases blindly, so they touch the speed, never the result.
 BLOCK_NS = 200_000  # the fixed cost of one block of draws
+SORT_NS = 60  # finding one draw among the earlier ones
 SETTLE_NS = 150_000  # the fixed cost of settling one selection
 
 
@@ -81,13 +82,18 @@ class PassPools:
         self.chunk = max(1, 2**24 // (self.block * len(self.packed)))
         bits = torch.arange(8, device=passes.device)
         self.set_bits = (torch.arange(256, device=passes.device)[:, None] >> bits) & 1
+        self.num_set = self.set_bits.sum(1)
+
+    def most(self, num_selections: int) -> int:
+        """Longest block of draws that fits into memory."""
+        return max(1, 2**24 // (num_selections * len(self.packed)))
 
     def open(self, num_selections: int) -> None:
         """Start this many selections, each with every member in its pool."""
         self.bits = self.packed.new_full((len(self.packed), num_selections), 255)
         self.bits[-1] >>= -len(self.scores) % 8  # no bit stands for no member
 
-    def narrow(self, cases: Tensor, closed: Tensor | None) -> tuple[Tensor, float]:
+    def narrow(self, cases: Tensor, closed: Tensor | None) -> tuple[Tensor, int]:
         """Filter each pool by its cases in turn.
 
         Args:
@@ -95,7 +101,7 @@ class PassPools:
             closed: Where the case does not count any more, ``[step, selection]``; None if nowhere.
 
         Returns:
-            Where members were removed, ``[step, selection]``, and the work it took.
+            Where members were removed, ``[step, selection]``, and the nanoseconds it took.
         """
         steps, selections = cases.shape
         passed = self.packed.gather(1, cases.reshape(-1).expand(len(self.packed), -1))
@@ -108,12 +114,12 @@ class PassPools:
                 spared |= closed[step]
             self.bits = kept.bitwise_or_(self.bits * spared)
             history.append(self.bits)
-        narrowed = torch.stack(history, 1).diff(dim=1).amax(0) > 0
-        return narrowed, BLOCK_NS + passed.numel()
+        narrowed = torch.stack(history).diff(dim=0).amax(1) > 0
+        return narrowed, passed.numel()
 
     def sizes(self) -> Tensor:
         """Members left in each pool, ``[selection]``."""
-        return self.set_bits.sum(1).take(self.bits.long()).sum(0)
+        return self.num_set.take(self.bits.long()).sum(0)
 
     def keep(self, selections: Tensor) -> None:
         """Go on with the selections at these indices only."""
@@ -157,7 +163,7 @@ class ScorePools:
         epsilon: How far from the best of its pool a member may be; None means not at all.
     """
 
-    block = 1  # one case leaves so few that a second one drawn along with it is often wasted
+    block = 1
 
     def __init__(self, scores: Tensor, epsilon: Epsilon | None) -> None:
         self.scores = scores.contiguous()
@@ -167,13 +173,17 @@ class ScorePools:
         floating = scores.dtype.is_floating_point
         self.lowest = -torch.inf if floating else torch.iinfo(scores.dtype).min
 
+    def most(self, num_selections: int) -> int:  # noqa: ARG002
+        """Longest block of draws: one case leaves so few that a second might go to waste."""
+        return 1
+
     def open(self, num_selections: int) -> None:
         """Start this many selections, each with every member in its pool."""
         self.full = True  # and no need to list everybody
         self.owner = self.member = self.cases.new_empty(0)
         self.size = self.cases.new_full((num_selections,), len(self.scores))
 
-    def narrow(self, cases: Tensor, closed: Tensor | None) -> tuple[Tensor, float]:
+    def narrow(self, cases: Tensor, closed: Tensor | None) -> tuple[Tensor, int]:
         """Filter each pool by its case; see `PassPools.narrow`."""
         case = cases[0]
         if self.full:
@@ -195,7 +205,7 @@ class ScorePools:
             stay = kept.nonzero().view(-1)
             self.member, self.owner = self.member.gather(0, stay), self.owner.gather(0, stay)
         before, self.size = self.size, self.owner.bincount(minlength=len(case))
-        return (self.size < before)[None], BLOCK_NS + 30 * values.numel()
+        return (self.size < before)[None], 30 * values.numel()
 
     def _spread(self, by_selection: Tensor) -> Tensor:
         """Give each pair what belongs to its selection."""
@@ -272,8 +282,9 @@ class Round:
         depth = looked
         drawn = selections.new_empty(0, len(selections))
         spent, landmark = 0.0, torch.inf
+        length = pools.block
         while True:
-            shape = (pools.block, len(selections))
+            shape = (length, len(selections))
             draws = torch.randint(len(cases), shape, generator=self.generator, device=self.device)
             drawn = torch.cat([drawn, draws])
             places, skipped = self._places(drawn, draws, looked, skipped)
@@ -300,7 +311,8 @@ class Round:
             # Draw on while the pools shrink. When they stop, go on only until the draws have cost
             # as much as settling would: then the total is never far from the cheaper of the two.
             pairs = int(sizes.sum())
-            spent += work
+            spent += work + SORT_NS * drawn.numel() + BLOCK_NS
+            length = min(2 * length, pools.most(len(selections)))
             if pairs <= landmark / 2:
                 spent, landmark = 0.0, pairs
             elif spent >= self._settling_work(len(selections), pairs):
@@ -319,10 +331,9 @@ class Round:
         A case drawn again takes no new place. The cases that were set aside because they split
         nobody stand in the order too, between the draws.
         """
-        earlier = draws.new_ones(len(draws), len(drawn), dtype=torch.bool)
-        earlier = earlier.tril(len(drawn) - len(draws) - 1)
-        again = (drawn == draws[:, None]).logical_and_(earlier[:, :, None])
-        fresh = again.view(torch.uint8).amax(1).logical_not_()  # far faster than any() of bools
+        ordered, order = drawn.sort(dim=0, stable=True)  # equal draws side by side, the first first
+        fresh = torch.ones_like(drawn, dtype=torch.bool)
+        fresh = fresh.scatter_(0, order[1:], ordered[1:] != ordered[:-1])[-len(draws) :]
         aside = self.num_cases - len(self.pools.cases)
         if not aside:
             return looked + fresh.cumsum(0), skipped

@@ -87,8 +87,8 @@ class MethodConfig:
     steps: int = 10  # CPL steps of each child (gradient)
     batch_size: int = 128  # preferences per CPL step and member (gradient)
     learning_rate: float = 2e-3  # of Adam (gradient)
-    teams: int = 12  # teams of policies in the population (teams)
-    team_generations: int = 10  # generations of 50 CPL steps (teams)
+    teams: int = 36  # teams of policies in the population (teams)
+    team_generations: int = 12  # generations of 50 CPL steps (teams)
     mutation_std: float = 0.1  # standard deviation of a mutation (gaussian)
 
 
@@ -192,16 +192,22 @@ def validate(config: Config) -> None:
         expect(proper, "raters.shares", "non-negative and sum to 1", raters.shares)
     expect(raters.label in ("regret", "return"), "raters.label", "regret or return", raters.label)
     response = raters.response
-    expect(response.rationality > 0, "raters.response.rationality", "positive", response.rationality)
+    expect(
+        response.rationality > 0, "raters.response.rationality", "positive", response.rationality
+    )
     expect(0 <= response.mistake <= 1, "raters.response.mistake", "in [0, 1]", response.mistake)
     expect(0 < response.myopia <= 1, "raters.response.myopia", "in (0, 1]", response.myopia)
     expect(response.tie >= 0, "raters.response.tie", "at least 0", response.tie)
-    expect(method.cases in ("rater", "preference"), "method.cases", "rater or preference", method.cases)
+    expect(
+        method.cases in ("rater", "preference"), "method.cases", "rater or preference", method.cases
+    )
     kinds = ("auto", "gradient", "gaussian", "teams")
     expect(method.variation in kinds, "method.variation", ", ".join(kinds), method.variation)
     expect(method.evolve in ("all", "head"), "method.evolve", "all or head", method.evolve)
     if method.variation == "gaussian":
-        expect(method.evolve == "head", "method.evolve", "head for Gaussian variation", method.evolve)
+        expect(
+            method.evolve == "head", "method.evolve", "head for Gaussian variation", method.evolve
+        )
     expect(method.members >= 2, "method.members", "at least 2, to select among", method.members)
     expect(all(units >= 1 for units in method.hidden), "method.hidden", "positive", method.hidden)
     expect(method.alpha > 0, "method.alpha", "positive", method.alpha)
@@ -218,7 +224,12 @@ def validate(config: Config) -> None:
     names = ("wandb", "csv")
     expect(config.logger.name in names, "logger.name", "wandb or csv", config.logger.name)
     expect(config.threads >= 1, "threads", "at least 1", config.threads)
-    expect(config.checkpoint_interval >= 1, "checkpoint_interval", "at least 1", config.checkpoint_interval)
+    expect(
+        config.checkpoint_interval >= 1,
+        "checkpoint_interval",
+        "at least 1",
+        config.checkpoint_interval,
+    )
     if data.load is not None:
         found = (Path(data.load) / "segments").is_dir()
         expect(found, "data.load", "the folder 'data' of an earlier run", data.load)

@@ -4,10 +4,12 @@ import fnmatch
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import gymnasium
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -93,7 +95,10 @@ def build_world(config: EnvConfig) -> World:
     name, tables ``[S, A]`` of action probabilities or functions; uniformly random otherwise).
 
     Raises:
-        ValueError: If the environment cannot be resolved or built.
+        ValueError: If the environment cannot be resolved or built, or ``mixture`` names behaviours
+            that it does not have.
+        TypeError: If it has no behaviours and its actions cannot be drawn at random, see
+            :func:`~popl_rl.segments.random_behaviour`.
     """
     factory = cast("Callable[..., gymnasium.Env[Any, Any]]", resolve("env", config.factory))
     leading = () if config.id is None else (config.id,)
@@ -111,8 +116,10 @@ def build_world(config: EnvConfig) -> World:
                 f"env.factory {config.factory!r} must return a gymnasium.Env, got {type(env)}"
             )
         if isinstance(env.action_space, gymnasium.spaces.Box):
-            # A Gaussian policy's mean knows no bounds.
-            env = gymnasium.wrappers.ClipAction(env)
+            # A Gaussian policy's mean knows no bounds. Gymnasium's own ClipAction would hide the
+            # bounds, which random actions need.
+            clip = partial(np.clip, a_min=env.action_space.low, a_max=env.action_space.high)
+            env = gymnasium.wrappers.TransformAction(env, clip, env.action_space)
         return env
 
     def make() -> gymnasium.Env[Any, Any]:

@@ -7,7 +7,7 @@ Segments, batch size ``[N]`` (N segments of T steps):
 | ``observation`` | ``[N, T, O]`` | float32 | what the policy sees before each step |
 | ``action`` | ``[N, T]`` or ``[N, T, A]`` | int64 or float32 | what was done |
 | ``reward`` | ``[N, T]`` | float32 | the environment's own reward, for raters that use it |
-| ``("info", name)`` | ``[N, T]`` | float32 or int64 | each number the environment's ``info`` gives |
+| ``("info", name)`` | ``[N, T]`` | float32 or int64 | each number of the ``info`` |
 
 Preferences, batch size ``[M]``:
 
@@ -17,7 +17,7 @@ Preferences, batch size ``[M]``:
 | ``answer`` | ``[M]`` | int64 | an :class:`Answer` |
 | ``rater`` | ``[M]`` | int64 | id of the person who answered |
 | ``("hidden", "group")`` | ``[M]`` | int64 | group of that person. For evaluation only |
-| ``("hidden", "utility")`` | ``[M, 2]`` | float32 | what each segment is worth to that group. For evaluation only |
+| ``("hidden", "utility")`` | ``[M, 2]`` | float32 | worth of each segment. For evaluation only |
 """
 
 from enum import IntEnum

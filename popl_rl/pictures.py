@@ -58,14 +58,18 @@ def draw(
     names = [group.name for group in judge.groups]
     metrics = pd.read_csv(run_dir / "metrics.csv")
     figures = {
-        "recovery": plots.recovery_bars(board.results),
         "learning": plots.learning_curves(metrics),
         "selection": plots.selection(metrics),
     }
+    if baselines is not None:
+        # Recovery is measured against the oracle.
+        figures["recovery"] = plots.recovery_bars(board.results)
     history = run_dir / "history.csv"
     if history.exists() and len(names) > 1:
         snapshots = pd.read_csv(history)
-        columns = [[c for c in snapshots if c.rsplit("/", 1)[0] == name] for name in names]
+        columns = [
+            [c for c in map(str, snapshots) if c.rsplit("/", 1)[0] == name] for name in names
+        ]
         accuracy = np.stack([snapshots[column].to_numpy() for column in columns], -1)
         pooled, oracle = None, None
         if baselines is not None:

@@ -45,9 +45,7 @@ class Scoreboard:
     def value(self, method: str, group: str, measure: str) -> float:
         """One number of the table."""
         rows = self.results
-        chosen = rows[
-            (rows.method == method) & (rows.group == group) & (rows.measure == measure)
-        ]
+        chosen = rows[(rows.method == method) & (rows.group == group) & (rows.measure == measure)]
         return float(chosen.value.iloc[0])
 
 

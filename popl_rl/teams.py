@@ -7,10 +7,10 @@ that together should explain whatever is preferred:
 
     p(preference) = sum_k share_k sigmoid(Delta_k)
 
-Members of a team divide the preferences among themselves by responsibility (the E-step of EM; Dempster,
-Laird and Rubin, 1977, as in MaxMin-RLHF, Chakraborty et al., 2024, but over policies and without being told the number of groups). Teams
-are selected by lexicase on small bundles of *held-out* preferences, and the smallest team that is
-as good as the best is the result, so neither group labels nor the number of groups is needed.
+Members of a team divide the preferences among themselves by responsibility: the E-step of EM
+(Dempster, Laird and Rubin, 1977), as in MaxMin-RLHF (Chakraborty et al., 2024), but over policies
+and without being told how many groups there are. Teams are selected by lexicase on small bundles
+of *held-out* preferences, and the smallest team that is as good as the best is the result.
 """
 
 from dataclasses import dataclass
@@ -62,9 +62,9 @@ class TeamSettings:
         folds: Folds of that training.
     """
 
-    teams: int = 12
+    teams: int = 36
     sizes: tuple[int, ...] = (2, 3, 4)
-    generations: int = 10
+    generations: int = 12
     steps: int = 50
     batch_size: int = 1000
     learning_rate: float = 2e-3
@@ -234,7 +234,8 @@ class TeamPOPL:
         """Log-likelihood of preferences under each team, ``[N, B] -> [teams, B]``."""
         log_share = self.share.clamp(min=1e-3).log()
         log_share = log_share.masked_fill(~self.active, -torch.inf).unsqueeze(-1)
-        return (log_odds.unflatten(0, self.active.shape) + log_share).logsumexp(1)
+        explained: Tensor = log_odds.unflatten(0, self.active.shape) + log_share
+        return explained.logsumexp(1)
 
     @torch.no_grad()
     def _update_shares(self) -> None:
@@ -250,7 +251,8 @@ class TeamPOPL:
         """Mean of held-out values over random bundles, ``[teams, cases]``."""
         cases = values.shape[1] // self.settings.bundle
         chosen = self._permutation(values.shape[1])[: cases * self.settings.bundle]
-        return values[:, chosen].unflatten(1, (cases, -1)).mean(2)
+        bundles: Tensor = values[:, chosen].unflatten(1, (cases, -1))
+        return bundles.mean(2)
 
     def _replace(self, parents: Tensor) -> None:
         """The first child of a parent is its copy; further ones exchange and lose members."""
@@ -322,7 +324,8 @@ class TeamPOPL:
         # All members see the same batch of few distinct observations: one matrix product.
         table = loss.population(self.bank.observation).log_softmax(-1).flatten(1)
         contrast = self._counts[preferred] - self.settings.conservatism * self._counts[other]
-        return loss.alpha * table @ contrast.T
+        batch: Tensor = loss.alpha * table @ contrast.T
+        return batch
 
     def _draw(self, comparisons: Comparisons) -> Tensor:
         shape, device = (self.settings.batch_size,), comparisons.preferred.device

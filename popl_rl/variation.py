@@ -93,9 +93,9 @@ class GaussianHead:
         """See :class:`Variation`; ``strength`` is not used."""
         self.population.replace_(parents)
         flat = self._flat()
-        draw = {"generator": self.generator, "device": flat.device}
-        coordinate = torch.randint(flat.shape[1], (len(flat), 1), **draw)
-        noise = self.std * torch.randn(len(flat), 1, **draw)
+        shape, source, device = (len(flat), 1), self.generator, flat.device
+        coordinate = torch.randint(flat.shape[1], shape, generator=source, device=device)
+        noise = self.std * torch.randn(shape, generator=source, device=device)
         self._write(flat.scatter_add(1, coordinate, noise))
         self._normalise()
         return {}

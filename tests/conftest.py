@@ -2,7 +2,9 @@
 
 import pytest
 import torch
+from hydra import compose, initialize_config_module
 
+import popl_rl.trainers.train_popl  # noqa: F401 - makes the schemas known to Hydra
 from popl_rl.comparisons import Comparisons
 from popl_rl.preferences import collect_preferences
 from popl_rl.raters import Raters, make_groups
@@ -11,6 +13,52 @@ from popl_rl.testing import likes_left, likes_right, tiny_env
 
 # Small tensors are slower on several threads, and tests share their cores.
 torch.set_num_threads(1)
+
+# A run of the whole trainer in a few seconds, long enough for oracles to beat random actions.
+TINY = [
+    "env.options={size: 7, doors: 2}",
+    "env.max_steps=20",
+    "method.generations=3",
+    "method.members=4",
+    "method.steps=2",
+    "method.hidden=[8]",
+    "data.segments=200",
+    "data.length=6",
+    "raters.count=8",
+    "raters.answers=10",
+    "evaluation.episodes=40",
+    "evaluation.new_raters=2",
+    "evaluation.pairs=200",
+    "evaluation.baseline_steps=100",
+    "evaluation.baseline_batch_size=64",
+    "evaluation.baseline_learning_rate=0.02",
+    "logger=csv",
+]
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--update-golden",
+        action="store_true",
+        help="rewrite tests/golden/*.json with what the tests now get",
+    )
+
+
+@pytest.fixture(scope="session")
+def tiny():
+    """Overrides of ``popl-train`` for a run of a few seconds."""
+    return list(TINY)
+
+
+@pytest.fixture(scope="session")
+def config_of():
+    """What Hydra makes of overrides."""
+
+    def make(*overrides, name="train"):
+        with initialize_config_module("popl_rl.configs", version_base="1.3"):
+            return compose(name, overrides=list(overrides))
+
+    return make
 
 
 @pytest.fixture

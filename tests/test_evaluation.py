@@ -1,5 +1,6 @@
 import math
 
+import gymnasium
 import pytest
 import torch
 from tensordict import TensorDict
@@ -189,6 +190,18 @@ def test_rolling_is_reproducible(greedy):
 
     assert torch.equal(actions(1), actions(1))
     assert greedy or not torch.equal(actions(1), actions(2))
+
+
+def test_continuous_policies_are_rolled(generator):
+    population = Population.create(PolicySpec(3, 1, False, (4,)), 2, generator=generator)
+    policies = PolicySet(population)
+    make = lambda: gymnasium.make("Pendulum-v1")  # noqa: E731
+    episodes = roll_out(make, policies, episodes=3, max_steps=4, seed=0)
+    assert episodes["action"].shape == (2, 3, 4, 1)
+    first = episodes["observation"][:, :, 0]
+    assert torch.equal(first[0], first[1])
+    expected = policies.act(first)
+    torch.testing.assert_close(episodes["action"][:, :, 0], expected)
 
 
 class Closable:

@@ -122,9 +122,9 @@ def test_catering_needs_a_strict_answer(two, steps):
 def test_fairness_by_hand(monkeypatch, two, steps, quantile, fairest):
     """Four raters with two answers each.
 
-    Policy 0 is right about raters 0-2 and wrong about rater 3: of the accuracies 0, 1, 1, 1 the 10 %
-    quantile lies at 0.1 * 3 = 0.3 between the first two, which is 0.3. Policy 1 is right about one
-    answer of each: every quantile is 1/2. The medians are 1 and 1/2.
+    Policy 0 is right about raters 0-2 and wrong about rater 3: of the accuracies 0, 1, 1, 1 the
+    10 % quantile lies at 0.1 * 3 = 0.3 between the first two, which is 0.3. Policy 1 is right about
+    one answer of each: every quantile is 1/2. The medians are 1 and 1/2.
     """
     margin = torch.tensor([[1.0] * 6 + [-1.0] * 2, [1.0, -1.0] * 4])
     monkeypatch.setattr("popl_rl.policy_set.margins", lambda *_, **__: margin)

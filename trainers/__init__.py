@@ -1,0 +1,1 @@
+"""Scripts that read top-down: train a policy set, judge one again."""

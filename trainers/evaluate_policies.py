@@ -1,8 +1,8 @@
 """Judge the policies of a finished run again: ``popl-evaluate``.
 
-    popl-evaluate run_dir=runs/<name>                         # as the run did, other raters
-    popl-evaluate run_dir=runs/<name> evaluation.answers=5    # cater from five answers
-    popl-evaluate run_dir=runs/<name> seed=1 evaluation.episodes=1000
+popl-evaluate run_dir=runs/<name>                         # as the run did, other raters
+popl-evaluate run_dir=runs/<name> evaluation.answers=5    # cater from five answers
+popl-evaluate run_dir=runs/<name> seed=1 evaluation.episodes=1000
 """
 
 import shutil
@@ -43,9 +43,7 @@ def run(config: EvaluateConfig) -> tuple[Path, Scoreboard]:
         load=kept if kept.is_dir() else None,
     )
     bank = SegmentBank.from_segments(data.steps)
-    judge = Judge(
-        world, stored.env, config.evaluation, groups, bank, data.worth, seed=config.seed
-    )
+    judge = Judge(world, stored.env, config.evaluation, groups, bank, data.worth, seed=config.seed)
     board = judge.score(policies, baselines)
     number = 1 + len(list((run_dir / "evaluations").glob("[0-9]*")))
     folder = run_dir / "evaluations" / f"{number:03d}"

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-import pandas as pd
 import torch
 from omegaconf import OmegaConf
 from rich.console import Console
@@ -80,7 +79,7 @@ def run(config: Config) -> Result:
         save_config(run_dir, config)
     write_metadata(run_dir, command=sys.argv)
     torch.set_num_threads(config.threads)
-    settings = OmegaConf.to_container(OmegaConf.structured(config), resolve=True)
+    settings: Any = OmegaConf.to_container(OmegaConf.structured(config), resolve=True)
 
     # 2. World, raters, and what they say.
     world = build_world(config.env)
@@ -110,16 +109,13 @@ def run(config: Config) -> Result:
     learner = stream(config.seed, "learner", config.device)
     spec = PolicySpec.from_env(world.env, hidden=config.method.hidden)
     popl = build_popl(config.method, spec, bank, comparisons, generator=learner)
-    judge = Judge(
-        world, config.env, config.evaluation, groups, bank, data.worth, seed=config.seed
-    )
+    judge = Judge(world, config.env, config.evaluation, groups, bank, data.worth, seed=config.seed)
     metrics = MetricsWriter(run_dir / "metrics.csv")
     history = MetricsWriter(run_dir / "history.csv")
     generations = generations_of(config.method)
+    logger_name: Any = config.logger.name
     with (
-        make_logger(
-            config.logger.name, run_dir, project=config.logger.project, config=settings
-        ) as logger,
+        make_logger(logger_name, run_dir, project=config.logger.project, config=settings) as logger,
         Progress("generations", total=generations) as progress,
     ):
 
@@ -171,9 +167,7 @@ def run(config: Config) -> Result:
         # 5. Judged by every hidden group; told in a table, in pictures and in words.
         board = judge.score(policies, baselines)
         write_atomic(run_dir / "results.csv", board.results.to_csv(index=False))
-        figures = draw(
-            run_dir, policies, baselines, board=board, judge=judge, world=world
-        )
+        figures = draw(run_dir, policies, baselines, board=board, judge=judge, world=world)
         logger.log_figures(figures, generations)
         logger.log_table("results", board.results)
     about = {

@@ -21,7 +21,7 @@ from torch import Tensor
 from popl_rl.lexicase import lexicase_report, lexicase_selection
 
 mpl.use("agg")
-from matplotlib import pyplot as plt  # noqa: E402  the backend comes first
+from matplotlib import pyplot as plt
 
 pytestmark = [pytest.mark.benchmark, pytest.mark.timeout(1800)]
 

@@ -1,0 +1,189 @@
+import math
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+import popl_rl.configs
+from popl_rl.config import (
+    Config,
+    EnvConfig,
+    LoggerConfig,
+    MethodConfig,
+    RatersConfig,
+    parse_epsilon,
+    validate,
+)
+
+FOLDER = Path(popl_rl.configs.__file__).parent
+SCHEMAS = {
+    "env": EnvConfig,
+    "raters": RatersConfig,
+    "method": MethodConfig,
+    "logger": LoggerConfig,
+}
+
+
+def valid(**changes):
+    """A valid configuration, but for the changes; dots of a path are written as ``__``."""
+    config = Config(raters=RatersConfig(groups=["upper", "lower"]))
+    for path, value in changes.items():
+        *sections, name = path.split("__")
+        section = config
+        for part in sections:
+            section = getattr(section, part)
+        assert hasattr(section, name)
+        setattr(section, name, value)
+    return config
+
+
+def problems_of(config):
+    with pytest.raises(ValueError, match="the configuration has problems:\n") as caught:
+        validate(config)
+    first, *problems = str(caught.value).split("\n  ")
+    assert first == "the configuration has problems:"
+    return problems
+
+
+def at_least_one(*paths):
+    return [
+        (path, value, f"{path.replace('__', '.')} must be at least 1, got {value}")
+        for path in paths
+        for value in (0, -3)
+    ]
+
+
+CASES = [
+    *at_least_one(
+        "env__max_steps",
+        "raters__count",
+        "raters__answers",
+        "data__segments",
+        "data__length",
+        "evaluation__episodes",
+        "evaluation__new_raters",
+        "evaluation__answers",
+        "evaluation__pairs",
+        "evaluation__baseline_steps",
+        "evaluation__baseline_batch_size",
+        "method__generations",
+        "method__steps",
+        "method__batch_size",
+        "method__teams",
+        "method__team_generations",
+        "threads",
+        "checkpoint_interval",
+    ),
+    ("env__mixture", {"a": 0.5, "b": 0.4},
+     "env.mixture must be non-negative shares that sum to 1, got {'a': 0.5, 'b': 0.4}"),
+    ("env__mixture", {"a": 1.5, "b": -0.5},
+     "env.mixture must be non-negative shares that sum to 1, got {'a': 1.5, 'b': -0.5}"),
+    ("env__mixture", {}, "env.mixture must be non-negative shares that sum to 1, got {}"),
+    ("raters__groups", [], "raters.groups must be one or more rater references, got []"),
+    ("raters__groups", ["upper", "upper"],
+     "raters.groups must be different groups, got ['upper', 'upper']"),
+    ("raters__shares", [1.0], "raters.shares must be one number per group (2), got [1.0]"),
+    ("raters__shares", [0.5, 0.6],
+     "raters.shares must be non-negative and sum to 1, got [0.5, 0.6]"),
+    ("raters__shares", [-0.5, 1.5],
+     "raters.shares must be non-negative and sum to 1, got [-0.5, 1.5]"),
+    ("raters__label", "taste", "raters.label must be regret or return, got 'taste'"),
+    ("raters__response__rationality", -1.0,
+     "raters.response.rationality must be positive, got -1.0"),
+    ("raters__response__mistake", 1.5, "raters.response.mistake must be in [0, 1], got 1.5"),
+    ("raters__response__myopia", 0.0, "raters.response.myopia must be in (0, 1], got 0.0"),
+    ("raters__response__myopia", math.nan, "raters.response.myopia must be in (0, 1], got nan"),
+    ("raters__response__tie", -0.1, "raters.response.tie must be at least 0, got -0.1"),
+    ("data__segments", 1, "data.segments must be at least 2, to compare, got 1"),
+    ("data__load", "/no/such/run/data",
+     "data.load must be the folder 'data' of an earlier run, got '/no/such/run/data'"),
+    ("method__cases", "group", "method.cases must be rater or preference, got 'group'"),
+    ("method__variation", "cosmic",
+     "method.variation must be auto, gradient, gaussian, teams, got 'cosmic'"),
+    ("method__variation", "gaussian",
+     "method.evolve must be head for Gaussian variation, got 'all'"),
+    ("method__evolve", "some", "method.evolve must be all or head, got 'some'"),
+    ("method__members", 1, "method.members must be at least 2, to select among, got 1"),
+    ("method__hidden", [64, 0], "method.hidden must be positive, got [64, 0]"),
+    ("method__epsilon", "some",
+     "method.epsilon must be mad, a number of at least 0, or null, got 'some'"),
+    ("method__alpha", 0.0, "method.alpha must be positive, got 0.0"),
+    ("method__alpha", math.nan, "method.alpha must be positive, got nan"),
+    ("method__conservatism", 1.1, "method.conservatism must be in (0, 1], got 1.1"),
+    ("method__conservatism", 0.0, "method.conservatism must be in (0, 1], got 0.0"),
+    ("method__discount", 0.0, "method.discount must be in (0, 1], got 0.0"),
+    ("method__discount", 1.01, "method.discount must be in (0, 1], got 1.01"),
+    ("method__warm_up", -1, "method.warm_up must be at least 0, got -1"),
+    ("method__learning_rate", 0.0, "method.learning_rate must be positive, got 0.0"),
+    ("method__mutation_std", -0.1, "method.mutation_std must be positive, got -0.1"),
+    ("evaluation__history", -1, "evaluation.history must be at least 0, got -1"),
+    ("logger__name", "paper", "logger.name must be wandb or csv, got 'paper'"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("path", "value", "message"), CASES)
+def test_a_problem_is_named_with_what_was_expected_and_what_came(path, value, message):
+    assert message in problems_of(valid(**{path: value}))
+
+
+def test_several_problems_are_reported_together():
+    config = valid(method__cases="group", method__alpha=-1.0, raters__count=0, logger__name="paper")
+    assert problems_of(config) == [
+        "raters.count must be at least 1, got 0",
+        "method.cases must be rater or preference, got 'group'",
+        "method.alpha must be positive, got -1.0",
+        "logger.name must be wandb or csv, got 'paper'",
+    ]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"raters__shares": [0.9, 0.1]},
+        {"raters__shares": [1 / 3, 2 / 3]},
+        {"env__mixture": {"planner/*": 0.5, "explorer": 0.5}},
+        {"method__variation": "gaussian", "method__evolve": "head"},
+        {"method__hidden": []},
+        {"method__epsilon": None},
+        {"method__epsilon": "0.25"},
+        {"method__warm_up": 0, "evaluation__history": 0},
+        {"raters__response__rationality": math.inf, "raters__response__mistake": 1.0},
+    ],
+)
+def test_valid_configurations_pass(changes):
+    validate(valid(**changes))
+
+
+def test_a_folder_with_segments_can_be_loaded(tmp_path):
+    (tmp_path / "segments").mkdir()
+    validate(valid(data__load=str(tmp_path)))
+
+
+@pytest.mark.parametrize(
+    ("epsilon", "expected"),
+    [(None, None), ("mad", "mad"), ("0.5", 0.5), (0.5, 0.5), ("0", 0.0), (1, 1.0)],
+)
+def test_epsilon_is_read(epsilon, expected):
+    assert parse_epsilon(epsilon) == expected
+
+
+@pytest.mark.parametrize("epsilon", ["", "MAD", "-0.1", -0.1, "nan", math.nan])
+def test_epsilon_refuses(epsilon):
+    message = "method.epsilon must be mad, a number of at least 0, or null, got"
+    with pytest.raises(ValueError, match=message):
+        parse_epsilon(epsilon)
+
+
+@pytest.mark.parametrize(
+    "path", sorted(FOLDER.glob("*/*.yaml")), ids=lambda path: f"{path.parent.name}/{path.stem}"
+)
+def test_every_choice_fits_its_schema_and_is_valid(path):
+    group = path.parent.name
+    config = OmegaConf.structured(valid())
+    config[group] = OmegaConf.merge(
+        OmegaConf.structured(SCHEMAS[group]), OmegaConf.load(path) or {}
+    )
+    if not config.raters.groups:
+        config.raters.groups = ["upper", "lower"]
+    validate(config)

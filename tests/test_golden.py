@@ -1,0 +1,109 @@
+"""Numbers of short runs, kept in golden/*.json: a change of results must be meant.
+
+Rewrite them with ``pytest tests/test_golden.py --update-golden`` and look at the difference.
+"""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+import popl_rl.popl
+import popl_rl.teams
+from popl_rl.losses import CPLLoss
+from popl_rl.policies import PolicySpec
+from popl_rl.popl import POPL
+from popl_rl.population import Population
+from popl_rl.teams import TeamPOPL, TeamSettings
+from popl_rl.variation import GaussianHead, GradientCPL
+
+FOLDER = Path(__file__).parent / "golden"
+SPEC = PolicySpec(5, 2, True, (8,))
+TEAMS = TeamSettings(
+    teams=4,
+    generations=4,
+    steps=3,
+    batch_size=32,
+    warm_up=5,
+    bundle=5,
+    first_selection=1,
+    polish_steps=50,
+    folds=2,
+)
+
+
+@pytest.fixture
+def selected(monkeypatch):
+    """Parents of each generation, as lexicase selection reports them."""
+    found = []
+
+    def watch(module):
+        original = module.lexicase_report
+
+        def report(*arguments, **options):
+            result = original(*arguments, **options)
+            found.append(result.parents.tolist())
+            return result
+
+        monkeypatch.setattr(module, "lexicase_report", report)
+
+    watch(popl_rl.popl)
+    watch(popl_rl.teams)
+    return found
+
+
+@pytest.fixture
+def golden(request):
+    """Compare with the file of a name, or rewrite it."""
+
+    def check(name, found):
+        path = FOLDER / f"{name}.json"
+        if request.config.getoption("--update-golden"):
+            path.write_text(json.dumps(found, indent=1) + "\n")
+            pytest.skip(f"{path.name} rewritten")
+        assert path.exists(), f"{path} is missing; make it with --update-golden"
+        expected = json.loads(path.read_text())
+        assert found["parents"] == expected["parents"]
+        assert found["numbers"] == pytest.approx(expected["numbers"], rel=1e-5, abs=1e-7)
+
+    return check
+
+
+def numbers(popl, metrics):
+    """The last generation's scalars, and what the members' tensors add up to."""
+    sums = {
+        "sum " + ".".join(name): float(value.abs().sum())
+        for name, value in popl.population.members.data.items(True, True)
+    }
+    return {**metrics, **sums}
+
+
+@pytest.mark.parametrize("variation", ["gradient", "gaussian"])
+def test_popl(bank, comparisons, selected, golden, generator, variation):
+    evolve = "head" if variation == "gaussian" else "all"
+    population = Population.create(SPEC, 6, evolve=evolve, generator=generator)
+    if variation == "gaussian":
+        varied = GaussianHead(population, generator=generator)
+    else:
+        loss = CPLLoss(population, bank)
+        varied = GradientCPL(
+            loss, comparisons, generations=3, steps=2, batch_size=16, generator=generator
+        )
+    popl = POPL(population, bank, comparisons, variation=varied, generator=generator)
+    metrics = [popl.step() for _ in range(3)][-1]
+    golden(f"popl_{variation}", {"parents": selected, "numbers": numbers(popl, metrics)})
+
+
+def test_teams(bank, comparisons, selected, golden, generator):
+    popl = TeamPOPL(SPEC, bank, comparisons, settings=TEAMS, generator=generator)
+    metrics = [popl.step() for _ in range(3)][-1]
+    policies = popl.policies()
+    found = numbers(popl, metrics)
+    found["members chosen"] = len(policies)
+    found["sum chosen"] = float(
+        torch.cat([v.flatten() for v in policies.population.members.data.values(True, True)])
+        .abs()
+        .sum()
+    )
+    golden("teams", {"parents": selected, "numbers": found})
