@@ -168,7 +168,11 @@ class ScorePools:
     def __init__(self, scores: Tensor, epsilon: Epsilon | None) -> None:
         self.scores = scores.contiguous()
         self.epsilon = epsilon
-        self.cases = (scores.amin(0) < scores.amax(0)).nonzero().view(-1)
+        few = scores[:8]  # mostly enough to see that members differ on every case
+        mixed = (few != few[0]).any(0)
+        if not mixed.all():
+            mixed = scores.amin(0) < scores.amax(0)
+        self.cases = mixed.nonzero().view(-1)
         self.chunk = max(1, 2**22 // len(scores))
         floating = scores.dtype.is_floating_point
         self.lowest = -torch.inf if floating else torch.iinfo(scores.dtype).min
@@ -254,6 +258,7 @@ class Round:
         self.device = weights.device
         self.num_cases = pools.scores.shape[1]
         self.known: dict[tuple[int, ...], Tensor] = {}
+        self.room = 2**22  # how many numbers ``known`` may still take up
 
     def select(self, num_selected: int) -> tuple[Tensor, Tensor]:
         """Select behaviours.
@@ -392,8 +397,9 @@ class Round:
         if self.pools.epsilon is not None:
             bar -= self.pools.epsilon.at(torch.arange(self.num_cases, device=self.device))
         cases = (rows.amin(0) < bar).nonzero().view(-1)
-        if len(self.known) < 2**24 // self.num_cases:  # selections often end in the same few pools
+        if len(cases) + len(key) <= self.room:  # selections often end in the same few pools
             self.known[key] = cases
+            self.room -= len(cases) + len(key)
         return cases
 
     def _choose(self, num_selected: int) -> Tensor:

@@ -17,7 +17,7 @@ from torchrl.data import TensorDictReplayBuffer
 
 from popl_rl.comparisons import Comparisons
 from popl_rl.config import DataConfig, EnvConfig, MethodConfig, RatersConfig, parse_epsilon
-from popl_rl.keys import ACTION, INFO, OBSERVATION
+from popl_rl.keys import ACTION, GROUP, INFO, OBSERVATION
 from popl_rl.losses import CPLLoss
 from popl_rl.planning import Table
 from popl_rl.policies import PolicySpec
@@ -273,6 +273,12 @@ def make_data(
         )[:].exclude("index")
     else:
         preferences = load_preferences(load / "preferences", num_segments=len(segments))
+        group = preferences.get(GROUP, None)
+        if group is not None and int(group.max()) >= len(groups):
+            raise ValueError(
+                f"{load} holds preferences of {int(group.max()) + 1} groups, but raters.groups "
+                f"names {len(groups)}; name the groups that were asked then"
+            )
     return Data(buffer, preferences, worth)
 
 

@@ -305,5 +305,5 @@ class PolicySet:
         policies = PolicySet(
             self.population.subset(members), alpha=self.alpha, discount=self.discount
         )
-        policies.origin = [self.origin[member] for member in members]
+        policies.origin = [self.origin[member] for member in members] if self.origin else []
         return policies

@@ -43,8 +43,12 @@ class Population(nn.Module):
         super().__init__()
         if not networks:
             raise ValueError("networks must hold at least one network, got none")
-        if len({str(network) for network in networks}) > 1:
-            raise ValueError("networks must share one architecture")
+        kinds = {str(network) for network in networks}
+        if len(kinds) > 1:
+            raise ValueError(
+                f"networks must share one architecture, got {' and '.join(sorted(kinds))}; build "
+                "them all from one PolicySpec"
+            )
         if evolve not in ("all", "head"):
             raise ValueError(f"evolve must be 'all' or 'head', got {evolve!r}")
         split = len(networks[0]) - 1 if evolve == "head" else 0

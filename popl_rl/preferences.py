@@ -134,8 +134,8 @@ def load_preferences(path: Path, *, num_segments: int) -> TensorDict:
         )
     if pair.min() < 0 or pair.max() >= num_segments:
         raise ValueError(
-            f"{path} compares segments up to number {int(pair.max())}, but there are "
-            f"{num_segments}; these preferences belong to other segments"
+            f"{path} compares segments {int(pair.min())}..{int(pair.max())}, but there are "
+            f"0..{num_segments - 1}; these preferences belong to other segments"
         )
     if answer.min() < 0 or answer.max() > max(Answer):
         raise ValueError(f"{path} holds answers outside 0..{max(Answer)}; it is damaged or foreign")

@@ -122,6 +122,49 @@ def markdown(
     return "\n\n".join(blocks) + "\n"
 
 
+def interval(
+    values: Sequence[float] | np.ndarray[Any, np.dtype[np.float64]],
+) -> tuple[float, float]:
+    """Mean and half-width of its 95 % interval (Student's t); the width of one value is NaN."""
+    numbers = np.asarray(values, dtype=float)
+    if len(numbers) < 2:
+        return float(numbers.mean()), float("nan")
+    error = numbers.std(ddof=1) / np.sqrt(len(numbers))
+    return float(numbers.mean()), float(stats.t.ppf(0.975, len(numbers) - 1) * error)
+
+
+def summary(runs: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+    """What several runs (seeds) of one setting say together.
+
+    Args:
+        runs: Tidy rows ``method, group, measure, value`` of each run, by its name.
+
+    Returns:
+        A row per method that has recoveries: ``method``, ``runs``, ``worst_recovery`` (mean over
+        runs of the worst group's) with half-width ``worst_recovery_ci``, ``worst_recovery_min``
+        over runs, and ``accuracy_gap``, the largest distance of a group's accuracy below the
+        oracle's in any run.
+    """
+    worst: dict[str, list[float]] = {}
+    gaps: dict[str, list[float]] = {}
+    for results in runs.values():
+        for method, value in worst_recovery(results).items():
+            worst.setdefault(method, []).append(value)
+        accuracy = results[results["measure"] == "accuracy"]
+        by_method = accuracy.pivot_table(index="group", columns="method", values="value")
+        if "oracle" in by_method:
+            for name in by_method:
+                gap = float((by_method["oracle"] - by_method[name]).max())
+                gaps.setdefault(str(name), []).append(gap)
+    rows = []
+    for method, values in worst.items():
+        mean, half = interval(values)
+        gap = max(gaps.get(method, [float("nan")]))
+        rows.append((method, len(values), mean, half, min(values), gap))
+    columns = ["method", "runs", "worst_recovery", "worst_recovery_ci", "worst_recovery_min"]
+    return pd.DataFrame(rows, columns=[*columns, "accuracy_gap"])
+
+
 def _methods(results: pd.DataFrame) -> list[str]:
     found = list(results["method"].unique())
     return [m for m in METHODS if m in found] + [m for m in found if m not in METHODS]
@@ -143,10 +186,9 @@ def _cell(measure: str, values: pd.Series) -> str:
     if not len(numbers):
         return "–"
     scale, decimals, unit = (100, 0, " %") if measure in _SHARES else (1, 2, "")
-    text = f"{scale * numbers.mean():z.{decimals}f}"
+    mean, half = interval(numbers)
+    text = f"{scale * mean:z.{decimals}f}"
     if len(numbers) > 1:
-        error = numbers.std(ddof=1) / np.sqrt(len(numbers))
-        half = stats.t.ppf(0.975, len(numbers) - 1) * error
         text += f" ± {scale * half:.{decimals}f}"
     return text.replace("-", "−") + unit
 

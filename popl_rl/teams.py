@@ -137,7 +137,8 @@ class TeamPOPL:
 
         Returns:
             Scalars to log: ``worst_rater_accuracy`` (share of held-out preferences that some
-            member of the best team passes), ``held_out_likelihood`` of the best team (mean log),
+            member of the best team passes), ``mean_accuracy`` of all members on them,
+            ``held_out_likelihood`` of the best team (mean log),
             ``selection_depth``, ``distinct`` teams, ``effective_parents``, ``team_size`` of the
             best team and ``loss``.
         """
@@ -158,6 +159,7 @@ class TeamPOPL:
         passed = (held.unflatten(0, self.active.shape) > 0) & self.active.unsqueeze(-1)
         metrics = {
             "worst_rater_accuracy": float(passed[best].any(0).float().mean()),
+            "mean_accuracy": float(passed[self.active].float().mean()),
             "held_out_likelihood": float(robust[best].mean()),
             "selection_depth": 0.0,
             "distinct": float(settings.teams),

@@ -16,6 +16,7 @@ def generator(seed: int = 0, device: str = "cpu") -> torch.Generator:
     return torch.Generator(device).manual_seed(seed)
 
 
+@settings(deadline=None)
 @given(num_cases=st.integers(1, 50), data=st.data(), seed=st.integers(0, 99))
 def test_random_sample_is_of_distinct_cases(num_cases, data, seed):
     num_kept = data.draw(st.integers(1, num_cases))
@@ -50,7 +51,7 @@ matrices = st.integers(1, 40).flatmap(
 )
 
 
-@settings(max_examples=40)
+@settings(max_examples=40, deadline=None)
 @given(rows=matrices, data=st.data(), seed=st.integers(0, 99))
 def test_each_case_kept_is_farthest_from_those_before_it(rows, data, seed):
     passes = torch.tensor(rows)

@@ -243,6 +243,13 @@ def test_data_of_another_environment_are_refused(world, tiny_groups, tmp_path):
         collect(other, tiny_groups, load=tmp_path)
 
 
+def test_data_of_more_groups_are_refused(world, tiny_groups, tmp_path):
+    collect(world, tiny_groups).save(tmp_path)
+    message = "holds preferences of 2 groups, but raters.groups names 1; name the groups that were"
+    with pytest.raises(ValueError, match=message):
+        collect(world, tiny_groups[:1], load=tmp_path)
+
+
 def test_foreign_data_are_refused(world, tiny_groups, tmp_path):
     save_tensordict(TensorDict({"observation": torch.zeros(30, 4, 5)}, [30]), tmp_path / "segments")
     with pytest.raises(ValueError, match="does not hold what was expected: 'action'"):

@@ -221,6 +221,7 @@ populations = st.integers(1, 9).flatmap(
 )
 
 
+@settings(deadline=None)
 @given(rows=populations, kind=st.sampled_from(["bool", "int", "float"]), seed=st.integers(0, 9))
 def test_no_parent_is_dominated_within_the_population(rows, kind, seed):
     scores = as_kind(rows, kind)
@@ -230,6 +231,7 @@ def test_no_parent_is_dominated_within_the_population(rows, kind, seed):
     assert not (no_worse & better).any()
 
 
+@settings(deadline=None)
 @given(
     rows=populations,
     kind=st.sampled_from(["bool", "int", "float"]),
@@ -366,7 +368,7 @@ def test_clashing_fingerprints_do_no_harm(monkeypatch):
     assert_distribution(report, PASSES, [0.0] * 5)
 
 
-@settings(max_examples=50)
+@settings(max_examples=50, deadline=None)
 @given(
     members=st.integers(2, 30), cases=st.integers(1, 700), flips=st.integers(0, 6), data=st.data()
 )

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from popl_rl.report import markdown, results_table, worst_recovery
+from popl_rl.report import markdown, results_table, summary, worst_recovery
 
 RESULTS = pd.DataFrame(
     [
@@ -104,3 +104,24 @@ def test_a_missing_column_is_named() -> None:
         worst_recovery(bad)
     with pytest.raises(ValueError, match=r"\['group'\] are missing"):
         markdown(bad, title="t", about={}, figures=[])
+
+
+def test_a_summary_is_about_the_worst_group_of_each_run():
+    """Worst recoveries 0.8 and 0.6: mean 0.7, half-width 12.706 * 0.1 (t, one degree)."""
+
+    def results(upper, lower, accuracy):
+        rows = [
+            ("popl", "upper", "recovery", upper),
+            ("popl", "lower", "recovery", lower),
+            ("popl", "upper", "accuracy", accuracy),
+            ("oracle", "upper", "accuracy", 0.9),
+        ]
+        return pd.DataFrame(rows, columns=["method", "group", "measure", "value"])
+
+    table = summary({"a": results(0.8, 1.0, 0.88), "b": results(0.9, 0.6, 0.85)})
+    row = table.set_index("method").loc["popl"]
+    assert row.runs == 2
+    assert row.worst_recovery == pytest.approx(0.7)
+    assert row.worst_recovery_ci == pytest.approx(12.706 * 0.1, rel=1e-3)
+    assert row.worst_recovery_min == pytest.approx(0.6)
+    assert row.accuracy_gap == pytest.approx(0.05)

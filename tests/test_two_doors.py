@@ -5,11 +5,13 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from tensordict import TensorDict
 
 from popl_rl.envs import two_doors as module
-from popl_rl.envs.two_doors import TwoDoors, two_doors
+from popl_rl.envs.two_doors import Explorer, TwoDoors, two_doors
 from popl_rl.planning import policy_return
 from popl_rl.raters import make_groups
+from popl_rl.rollouts import lockstep
 
 RIGHT, DOWN, LEFT, UP = range(4)
 TURN_LEFT, TURN_RIGHT, FORWARD = range(3)
@@ -238,13 +240,14 @@ def test_the_mirror_image_of_upper_is_lower():
 def test_behaviours_are_policies_that_use_their_doors():
     env = two_doors(doors=3)
     behaviours = env.behaviours()
-    assert len(behaviours) == 10
-    assert list(behaviours)[:3] == ["upper-0.03", "upper-0.1", "upper-0.3"]
-    for probabilities in behaviours.values():
+    names = [f"planner/upper/{temperature}" for temperature in (0.03, 0.1, 0.3)]
+    assert list(behaviours)[:3] == names
+    assert list(behaviours)[9:] == ["explorer", "random"]
+    for probabilities in [v for name, v in behaviours.items() if name != "explorer"]:
         assert probabilities.shape == (len(env.states), 3)
         torch.testing.assert_close(probabilities.sum(1), torch.ones(len(env.states)))
     shares = []
-    for name in ("third-0.03", "third-0.1", "random"):
+    for name in ("planner/third/0.03", "planner/third/0.1", "random"):
         table, passed = through(env, 2)
         shares.append(policy_return(table, behaviours[name], passed, horizon=60))
     assert shares[0] > 0.95
@@ -259,7 +262,7 @@ def test_behaviours_are_policies_that_use_their_doors():
         ({"size": -3}, "fits is 7"),
         ({"doors": 1}, "doors must be 2, 3 or 4, got 1"),
         ({"doors": 5}, "doors must be 2, 3 or 4, got 5"),
-        ({"start": "far"}, "start must be 'near' or 'anywhere', got 'far'"),
+        ({"start": "far"}, "start must be 'near', 'anywhere' or 'mixed', got 'far'"),
         ({"max_steps": 0}, "max_steps must be at least 1, got 0"),
     ],
 )
@@ -274,3 +277,41 @@ def test_actions_of_minigrid_that_are_left_out(action):
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"action must be 0 \(left\), 1 \(right\) or 2"):
         env.step(action)
+
+
+def test_an_explorer_passes_every_door_and_never_means_to_end_the_episode():
+    env = two_doors(start="anywhere")
+    world = env.unwrapped
+    explorer = Explorer(world.transition_table(), world.cells, slip=0.0)
+    generator = torch.Generator().manual_seed(0)
+    episodes = lockstep(
+        [two_doors(start="anywhere", max_steps=200) for _ in range(8)],
+        lambda step: explorer(step, generator),
+        seeds=range(8),
+        max_steps=200,
+    )
+    assert episodes["mask"].all()
+    assert not episodes["info", "goal"].any()
+    assert {0, 1} <= set(episodes["info", "door"].unique().tolist())
+
+
+def test_a_reset_explorer_takes_any_number_of_walkers():
+    world = two_doors().unwrapped
+    explorer = Explorer(world.transition_table(), world.cells)
+    generator = torch.Generator().manual_seed(0)
+    for count in (3, 5):
+        explorer.reset()
+        step = TensorDict({"info": {"next_state": torch.zeros(count).long()}}, [count])
+        action = explorer(step, generator)
+        assert action.shape == (count,)
+        assert set(action.tolist()) <= {0, 1, 2}
+
+
+def test_mixed_starts_are_half_near_and_half_anywhere():
+    world = two_doors(start="mixed").unwrapped
+    start = world.transition_table().start
+    near = torch.tensor([tuple(cell) in set(world.near_cells) for cell in world.cells.tolist()])
+    free = len(world.states) - 4  # the goal's four directions are no starts
+    expected = 0.5 + 0.5 * len(world.near_cells) * 4 / free
+    assert start[near].sum().item() == pytest.approx(expected, abs=1e-5)
+    assert start.sum().item() == pytest.approx(1.0, abs=1e-5)
