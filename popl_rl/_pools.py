@@ -77,7 +77,7 @@ class PassPools:
         self.packed = _pack(self.scores)  # [member / 8, case]
         mixed = (self.packed.amax(0) > 0).logical_and_(self.packed.amin(0) < 255)
         self.cases = mixed.nonzero().view(-1)
-        # Cases that half the members pass leave one in a thousand pools undecided after this many.
+        # After this many cases that half the members pass, one pool in 256 is still undecided.
         self.block = (len(passes) - 1).bit_length() + 8
         self.chunk = max(1, 2**24 // (self.block * len(self.packed)))
         bits = torch.arange(8, device=passes.device)
@@ -280,6 +280,7 @@ class Round:
         return self._choose(num_selected), self.depth
 
     def _run(self, selections: Tensor) -> None:
+        """Take these selections from full pools to their end, all together."""
         pools, cases = self.pools, self.pools.cases
         pools.open(len(selections))
         looked = torch.zeros_like(selections)  # length of the order so far

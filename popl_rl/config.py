@@ -84,8 +84,8 @@ class MethodConfig:
     conservatism: float = 0.9  # lambda of the CPL loss, in (0, 1]
     discount: float = 1.0  # per-step discount of the scores
     warm_up: int = 20  # pooled CPL steps before the first generation
-    steps: int = 10  # CPL steps of each child (gradient)
-    batch_size: int = 128  # preferences per CPL step and member (gradient)
+    steps: int = 15  # CPL steps of each child (gradient)
+    batch_size: int = 256  # preferences per CPL step and member (gradient)
     learning_rate: float = 2e-3  # of Adam (gradient)
     teams: int = 36  # teams of policies in the population (teams)
     team_generations: int = 12  # generations of 50 CPL steps (teams)

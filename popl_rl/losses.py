@@ -113,10 +113,15 @@ class CPLLoss(LossModule):
             if self._features is None:
                 self._features = population.trunk(bank.observation)
             output = population.from_features(self._features)
-            output = output.gather(1, row.unsqueeze(-1).expand(-1, -1, output.shape[-1]))
+            if population.spec.discrete:
+                # Normalise the few distinct rows, not every step of the batch.
+                table, cell = output.log_softmax(-1).flatten(1), row * output.shape[-1] + action
+                value = table.gather(1, cell)
+            else:
+                output = output.gather(1, row.unsqueeze(-1).expand(-1, -1, output.shape[-1]))
+                value = log_prob(population.spec, output, action)
         else:
-            output = population(bank.observation[row])
-        value = log_prob(population.spec, output, action)
+            value = log_prob(population.spec, population(bank.observation[row]), action)
         steps = torch.arange(bank.row.shape[1], device=value.device).float()
         scores: Tensor = value.view(*segment.shape, -1) @ (self.alpha * self.discount**steps)
         return scores

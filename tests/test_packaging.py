@@ -24,6 +24,7 @@ TREES = {
 def execute(*command, cwd, **environment):
     done = subprocess.run(
         list(map(str, command)),
+        check=False,
         cwd=cwd,
         env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
         capture_output=True,

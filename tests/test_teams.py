@@ -235,35 +235,3 @@ def test_a_team_of_one_is_enough_if_it_is_as_good(monkeypatch, bank, comparisons
         popl, "_explain", lambda log_odds: torch.full((3, log_odds.shape[1]), math.log(0.7))
     )
     assert len(popl.policies()) == 1
-
-
-def test_two_groups_are_told_apart_without_rater_ids(bank, groups, segments):
-    """Half of the preferences want the left end, half the right one: no member serves both."""
-    worth = torch.stack([group.worth(segments) for group in groups])
-    pair = torch.randint(40, (2, 400), generator=torch.Generator().manual_seed(0))
-    group = torch.arange(400) % 2
-    first, second = worth[group, pair[0]], worth[group, pair[1]]
-    keep = first != second
-    swap = (first < second)[keep]
-    preferred = torch.where(swap, pair[1][keep], pair[0][keep])
-    other = torch.where(swap, pair[0][keep], pair[1][keep])
-    comparisons = teams.Comparisons(preferred, other, torch.arange(len(other)), len(other))
-    popl = make(
-        bank,
-        comparisons,
-        sizes=(2,),
-        removal=0.0,
-        exchange=0.0,
-        steps=50,
-        batch_size=200,
-        learning_rate=0.02,
-        noise=0.5,
-        weight_decay=0.0,
-        polish_steps=300,
-    )
-    for _ in range(SMALL.generations):
-        popl.step()
-    policies = popl.policies()
-    scores = teams.margins(policies.population, bank, comparisons, alpha=policies.alpha) > 0
-    accuracy = torch.stack([scores[:, group[keep] == g].float().mean(1) for g in (0, 1)], 1)
-    assert bool((accuracy.amax(0) > 0.8).all()), accuracy

@@ -148,7 +148,7 @@ def test_without_baselines(train):
 
 
 def test_an_oracle_no_better_than_random_leaves_recovery_open(train):
-    """Episodes of three steps are too short to reach the goal, so all policies are worth the same."""
+    """Nobody reaches the goal in three steps, so all policies are worth the same."""
     result = train("env.max_steps=3", "data.length=3", "evaluation.episodes=2")
     assert (result.run_dir / "report.md").is_file()
 
