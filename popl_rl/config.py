@@ -221,6 +221,14 @@ def validate(config: Config) -> None:
     except ValueError as error:
         problems.append(str(error))
     expect(evaluation.history >= 0, "evaluation.history", "at least 0", evaluation.history)
+    for name in ("baseline_learning_rate", "baseline_alpha"):
+        value = getattr(evaluation, name)
+        expect(value > 0, f"evaluation.{name}", "positive", value)
+    conservatism = evaluation.baseline_conservatism
+    proper = 0 < conservatism <= 1
+    expect(proper, "evaluation.baseline_conservatism", "in (0, 1]", conservatism)
+    proper = config.device.split(":")[0] in ("cpu", "cuda")
+    expect(proper, "device", "cpu or cuda", config.device)
     names = ("wandb", "csv")
     expect(config.logger.name in names, "logger.name", "wandb or csv", config.logger.name)
     expect(config.threads >= 1, "threads", "at least 1", config.threads)

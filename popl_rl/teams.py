@@ -13,6 +13,7 @@ and without being told how many groups there are. Teams are selected by lexicase
 of *held-out* preferences, and the smallest team that is as good as the best is the result.
 """
 
+import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -349,7 +350,8 @@ class TeamPOPL:
             "members": self.population.members.data.clone().to_dict(),
             "active": self.active.clone(),
             "share": self.share.clone(),
-            "optimizer": self.optimizer.state_dict(),
+            # A copy: Adam's own state goes on changing in place.
+            "optimizer": copy.deepcopy(self.optimizer.state_dict()),
             "generator": self.generator.get_state(),
         }
 
@@ -358,7 +360,7 @@ class TeamPOPL:
         self.generation = int(state["generation"])
         self.population.members.data.update_(state["members"])
         self.active, self.share = state["active"].clone(), state["share"].clone()
-        self.optimizer.load_state_dict(state["optimizer"])
+        self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
         self.generator.set_state(state["generator"].cpu())
 
 

@@ -1,5 +1,6 @@
 """How children differ from their parents: Gaussian mutation of a head, or CPL gradient steps."""
 
+import copy
 from typing import Any, Protocol
 
 import torch
@@ -177,9 +178,10 @@ class GradientCPL:
     def state_dict(self) -> dict[str, Any]:
         """Adam's moments and the learning rate."""
         # A scheduler's own state holds its lambda; how far it is, is all it needs.
-        return {"optimizer": self.optimizer.state_dict(), "epoch": self.schedule.last_epoch}
+        state = copy.deepcopy(self.optimizer.state_dict())  # Adam changes its own in place
+        return {"optimizer": state, "epoch": self.schedule.last_epoch}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore Adam's moments and the learning rate."""
-        self.optimizer.load_state_dict(state["optimizer"])
+        self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
         self.schedule.last_epoch = int(state["epoch"])

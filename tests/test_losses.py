@@ -156,7 +156,10 @@ def test_members_learn_independently(generator, evolve, discrete):
     """Two members trained together end where each ends when trained alone on its batches."""
     spec = PolicySpec(3, 2, discrete, (6,))
     population = Population.create(spec, 2, evolve=evolve, generator=generator)
-    action = torch.randint(2, (9, 4)) if discrete else torch.randn(9, 4, 2, generator=generator)
+    if discrete:
+        action = torch.randint(2, (9, 4), generator=generator)
+    else:
+        action = torch.randn(9, 4, 2, generator=generator)
     bank = SegmentBank(
         torch.randn(36, 3, generator=generator), torch.arange(36).view(9, 4), action, False
     )

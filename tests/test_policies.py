@@ -132,7 +132,10 @@ def test_actors_agree_with_log_prob(discrete, action_dim, hidden, action_std, se
 def test_actions_are_shared_by_members(generator, discrete):
     spec = PolicySpec(1, 2, discrete)
     output = torch.randn(3, 4, 2, generator=generator)
-    action = torch.randint(2, (4,)) if discrete else torch.randn(4, 2)
+    if discrete:
+        action = torch.randint(2, (4,), generator=generator)
+    else:
+        action = torch.randn(4, 2, generator=generator)
     together = log_prob(spec, output, action)
     assert together.shape == (3, 4)
     for member in range(3):

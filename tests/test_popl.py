@@ -77,7 +77,10 @@ def test_margins_by_hand():
 def test_swapping_sides_negates_margins(seed, discrete, discount):
     generator = torch.Generator().manual_seed(seed)
     population = Population.create(PolicySpec(2, 3, discrete, (4,)), 3, generator=generator)
-    action = torch.randint(3, (6, 4)) if discrete else torch.randn(6, 4, 3, generator=generator)
+    if discrete:
+        action = torch.randint(3, (6, 4), generator=generator)
+    else:
+        action = torch.randn(6, 4, 3, generator=generator)
     observation = torch.randn(24, 2, generator=generator)
     bank = SegmentBank(observation, torch.arange(24).view(6, 4), action, False)
     rows = torch.randint(6, (2, 10), generator=generator)

@@ -10,7 +10,8 @@ import torch
 
 from popl_rl.policy_set import PolicySet
 
-pytestmark = pytest.mark.timeout(240)
+# Three runs in processes of their own: half a minute on a quiet machine.
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
 def start(folder, *overrides):

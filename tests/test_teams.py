@@ -195,6 +195,7 @@ def test_every_generation_moves_the_members_and_reports_numbers(bank, comparison
     metrics = popl.step()
     assert set(metrics) == {
         "worst_rater_accuracy",
+        "mean_accuracy",
         "held_out_likelihood",
         "selection_depth",
         "distinct",

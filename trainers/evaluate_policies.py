@@ -13,7 +13,7 @@ import hydra
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from popl_rl.config import Config, EvaluateConfig
+from popl_rl.config import Config, EvaluateConfig, validate
 from popl_rl.experiment import build_groups, build_world, make_data
 from popl_rl.policy_set import PolicySet
 from popl_rl.report import markdown, results_table
@@ -27,6 +27,8 @@ def run(config: EvaluateConfig) -> tuple[Path, Scoreboard]:
     """Judge again; returns the folder that was written and the scoreboard."""
     run_dir = Path(config.run_dir)
     stored: Any = OmegaConf.merge(OmegaConf.structured(Config), load_config(run_dir))
+    stored.evaluation = config.evaluation
+    validate(stored)
     policies = PolicySet.load(run_dir / "policies")
     base_path = run_dir / "baselines"
     baselines = PolicySet.load(base_path) if base_path.is_dir() else None

@@ -146,6 +146,11 @@ def run(config: Config) -> Result:
         # 4. What the set is compared with, on the same data.
         baselines = None
         if config.evaluation.baselines:
+            if GROUP not in data.preferences.keys(True):
+                raise ValueError(
+                    "the loaded preferences name no hidden groups, which the oracle needs; set "
+                    "evaluation.baselines=false"
+                )
             strict = data.preferences[ANSWER] <= Answer.SECOND
             weight = group_weights(data.preferences[GROUP][strict], len(groups))
             with Progress("baselines", total=config.evaluation.baseline_steps) as baseline_bar:
