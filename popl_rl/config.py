@@ -169,6 +169,11 @@ def validate(config: Config) -> None:
         config.evaluation,
     )
     at_least_one(config.env, "env", "max_steps")
+    reference = "a reference, such as env.factory=my_env.py:make"
+    expect(bool(config.env.factory), "env.factory", reference, config.env.factory)
+    if config.env.factory == "gymnasium:make":
+        name = "the id of a Gymnasium environment, such as env.id=CartPole-v1"
+        expect(bool(config.env.id), "env.id", name, config.env.id)
     mixture = config.env.mixture
     if mixture is not None:
         proper = all(share >= 0 for share in mixture.values())

@@ -125,7 +125,8 @@ def test_what_the_user_can_put_right(train, overrides, parts):
 
 
 def test_a_setting_that_must_be_given(call, tiny):
-    assert_explains(call(train_popl.cli, *tiny[1:], "env=gym"), "env.id")
+    assert_explains(call(train_popl.cli, *tiny[1:], "env=gym"), "env.id", "CartPole")
+    assert_explains(call(train_popl.cli, *tiny[1:], "env=custom"), "env.factory", "my_env.py")
 
 
 def test_several_problems_are_told_at_once(train):

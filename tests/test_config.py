@@ -186,4 +186,10 @@ def test_every_choice_fits_its_schema_and_is_valid(path):
     )
     if not config.raters.groups:
         config.raters.groups = ["upper", "lower"]
+    must_be_given = {"gym": ("id", "CartPole-v1"), "custom": ("factory", "my_env.py:make")}
+    if path.stem in must_be_given:
+        name, value = must_be_given[path.stem]
+        with pytest.raises(ValueError, match=rf"env\.{name} must be"):
+            validate(config)
+        config.env[name] = value
     validate(config)
