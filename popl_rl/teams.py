@@ -151,11 +151,7 @@ class TeamPOPL:
             _descend(value, self.optimizer)
         self.generation += 1
         self._update_shares()
-        held = margins(
-            self.population, self.bank, self.held, alpha=self.alpha, discount=self.discount
-        )
-        likelihood = self._explain(F.logsigmoid(held)).exp()
-        robust = (_OUTLIERS + (1 - 2 * _OUTLIERS) * likelihood).log()
+        held, robust = self._held_out()
         best = int(robust.mean(1).argmax())
         passed = (held.unflatten(0, self.active.shape) > 0) & self.active.unsqueeze(-1)
         metrics = {
@@ -181,11 +177,7 @@ class TeamPOPL:
 
     def policies(self) -> PolicySet:
         """Choose the smallest team as good as the best, and polish it."""
-        held = margins(
-            self.population, self.bank, self.held, alpha=self.alpha, discount=self.discount
-        )
-        likelihood = self._explain(F.logsigmoid(held)).exp()
-        robust = (_OUTLIERS + (1 - 2 * _OUTLIERS) * likelihood).log()
+        _, robust = self._held_out()
         behind = robust[robust.mean(1).argmax()] - robust
         # One-standard-error rule: a bigger team has to earn its members.
         error = behind.std(1) / behind.shape[1] ** 0.5
@@ -232,6 +224,14 @@ class TeamPOPL:
         policies = PolicySet(polished, alpha=settings.polish_alpha, discount=self.discount)
         policies.origin = []  # trained on, they are no longer members of the population
         return policies
+
+    def _held_out(self) -> tuple[Tensor, Tensor]:
+        """Margins ``[N, H]`` and robust log-likelihoods ``[teams, H]`` of held-out preferences."""
+        held = margins(
+            self.population, self.bank, self.held, alpha=self.alpha, discount=self.discount
+        )
+        likelihood = self._explain(F.logsigmoid(held)).exp()
+        return held, (_OUTLIERS + (1 - 2 * _OUTLIERS) * likelihood).log()
 
     def _explain(self, log_odds: Tensor) -> Tensor:
         """Log-likelihood of preferences under each team, ``[N, B] -> [teams, B]``."""
