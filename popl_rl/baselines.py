@@ -7,8 +7,8 @@ from torch import Tensor
 
 from popl_rl.comparisons import Comparisons
 from popl_rl.losses import CPLLoss, descend, linear_decay
-from popl_rl.policies import PolicySpec
-from popl_rl.policy_set import PolicySet
+from popl_rl.policies import Spec
+from popl_rl.policy_set import HypothesisSet, as_set
 from popl_rl.population import Population
 from popl_rl.segments import SegmentBank
 
@@ -40,7 +40,7 @@ def group_weights(group: Tensor, num_groups: int) -> Tensor:
 
 
 def train_cpl(
-    spec: PolicySpec,
+    spec: Spec,
     bank: SegmentBank,
     comparisons: Comparisons,
     weight: Tensor,
@@ -53,8 +53,11 @@ def train_cpl(
     discount: float = 1.0,
     generator: torch.Generator,
     progress: Callable[[int], None] | None = None,
-) -> PolicySet:
+) -> HypothesisSet:
     """Train plain CPL policies (arXiv 2310.13639), several at once.
+
+    Of reward functions, with ``conservatism=1``, this is Bradley–Terry reward learning as in RLHF
+    (Christiano et al., 2017).
 
     Args:
         spec: Sizes of the policies.
@@ -90,4 +93,4 @@ def train_cpl(
         schedule.step()
         if progress is not None:
             progress(min(done + _BLOCK, steps))
-    return PolicySet(population, alpha=alpha, discount=discount)
+    return as_set(population, alpha=alpha, discount=discount)

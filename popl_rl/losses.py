@@ -8,7 +8,6 @@ from torch.optim.lr_scheduler import LambdaLR
 from torchrl.objectives.common import LossModule
 
 from popl_rl.comparisons import Comparisons
-from popl_rl.policies import log_prob
 from popl_rl.population import Population
 from popl_rl.segments import SegmentBank
 
@@ -44,7 +43,9 @@ def cpl_loss(preferred: Tensor, other: Tensor, *, conservatism: float = 1.0) -> 
 class CPLLoss(LossModule):
     """CPL loss of every member of a population, each on a batch of its own.
 
-    Contrastive Preference Learning (Hejna et al., arXiv 2310.13639, equation 6).
+    Contrastive Preference Learning (Hejna et al., arXiv 2310.13639, equation 6). With reward
+    functions and ``conservatism=1`` it is the Bradley–Terry loss on sums of rewards (Christiano et
+    al., 2017, equation 1).
 
     Args:
         population: N members.
@@ -115,13 +116,14 @@ class CPLLoss(LossModule):
             output = population.from_features(self._features)
             if population.spec.discrete:
                 # Normalise the few distinct rows, not every step of the batch.
-                table, cell = output.log_softmax(-1).flatten(1), row * output.shape[-1] + action
+                table = population.spec.table(output).flatten(1)
+                cell = row * output.shape[-1] + action
                 value = table.gather(1, cell)
             else:
                 output = output.gather(1, row.unsqueeze(-1).expand(-1, -1, output.shape[-1]))
-                value = log_prob(population.spec, output, action)
+                value = population.spec.step_scores(output, action)
         else:
-            value = log_prob(population.spec, population(bank.observation[row]), action)
+            value = population.spec.step_scores(population(bank.observation[row]), action)
         steps = torch.arange(bank.row.shape[1], device=value.device).float()
         scores: Tensor = value.view(*segment.shape, -1) @ (self.alpha * self.discount**steps)
         return scores

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import gymnasium
 import torch
@@ -13,7 +13,38 @@ from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor
 
 from popl_rl.keys import ACTION, OBSERVATION
 
-__all__ = ["PolicySpec", "build_actor", "build_network", "log_prob"]
+__all__ = ["PolicySpec", "Spec", "build_actor", "build_network", "log_prob"]
+
+
+class Spec(Protocol):
+    """What a population has to know of its members: policies, or reward functions.
+
+    Attributes:
+        observation_dim: Length O of an observation vector.
+        action_dim: Number K of outputs of a network.
+        hidden: Units of each hidden layer.
+        discrete: Whether an action is a choice of one among the ``action_dim`` outputs.
+        output_bias: Whether the last layer has a bias.
+    """
+
+    @property
+    def observation_dim(self) -> int: ...  # noqa: D102
+    @property
+    def action_dim(self) -> int: ...  # noqa: D102
+    @property
+    def hidden(self) -> tuple[int, ...]: ...  # noqa: D102
+    @property
+    def discrete(self) -> bool: ...  # noqa: D102
+    @property
+    def output_bias(self) -> bool: ...  # noqa: D102
+
+    def table(self, output: Tensor) -> Tensor:
+        """What choosing each of the outputs adds to a segment's score, ``[..., K]``."""
+        ...
+
+    def step_scores(self, output: Tensor, action: Tensor) -> Tensor:
+        """What a step with this action adds to a segment's score, ``[...]``."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -75,9 +106,22 @@ class PolicySpec:
             )
         return cls(observation.shape[0], size, discrete, tuple(hidden), action_std)
 
+    @property
+    def output_bias(self) -> bool:
+        """The last layer has a bias: it says which action is likely anywhere."""
+        return True
 
-def build_network(spec: PolicySpec, *, generator: torch.Generator) -> nn.Sequential:
-    """Build one policy network, ``[..., O] -> [..., action_dim]`` (logits or mean action).
+    def table(self, output: Tensor) -> Tensor:
+        """Log-probabilities of discrete actions, ``[..., K]``."""
+        return output.log_softmax(-1)
+
+    def step_scores(self, output: Tensor, action: Tensor) -> Tensor:
+        """See :func:`log_prob`."""
+        return log_prob(self, output, action)
+
+
+def build_network(spec: Spec, *, generator: torch.Generator) -> nn.Sequential:
+    """Build one network, ``[..., O] -> [..., K]`` (logits, mean action, or rewards).
 
     Args:
         spec: Sizes of the network.
@@ -95,6 +139,7 @@ def build_network(spec: PolicySpec, *, generator: torch.Generator) -> nn.Sequent
             out_features=spec.action_dim,
             num_cells=list(spec.hidden),
             activation_class=nn.ReLU,
+            bias_last_layer=spec.output_bias,
         )
     # A plain Sequential, because an MLP cannot be sliced into trunk and head.
     return nn.Sequential(*layers)

@@ -1,4 +1,4 @@
-"""The result of training: a set of policies, and choosing from it for one person or for all."""
+"""The result of training: a set of hypotheses, and choosing from it for one person or for all."""
 
 import json
 import shutil
@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal, Self, cast
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
@@ -19,42 +19,40 @@ from popl_rl.lexicase import lexicase_selection
 from popl_rl.policies import PolicySpec, build_actor, build_network
 from popl_rl.popl import case_values, margins
 from popl_rl.population import Population
+from popl_rl.rewards import RewardSpec, reward_bank
 from popl_rl.segments import SegmentBank, load_tensordict, save_tensordict
 
-__all__ = ["Catered", "PolicySet"]
-
-_FORMAT = "popl_rl.policy_set/1"
+__all__ = ["Catered", "HypothesisSet", "PolicySet", "RewardSet", "as_set", "load_set"]
 
 
 @dataclass(frozen=True)
 class Catered:
-    """A choice from a policy set for one rater.
+    """A choice from a set for one rater.
 
     Attributes:
-        member: The chosen policy.
-        weights: Belief in each policy, ``[N]``, summing to 1.
+        member: The chosen hypothesis.
+        weights: Belief in each hypothesis, ``[N]``, summing to 1.
     """
 
     member: int
     weights: Tensor
 
 
-class PolicySet:
-    """Policies of which every hidden group should find its own.
+class HypothesisSet:
+    """Hypotheses about what people want, of which every hidden group should find its own.
 
     Args:
-        population: The policies.
+        population: The hypotheses.
         alpha: Scale of their scores, as trained.
         discount: Per-step discount of their scores.
 
     Attributes:
-        origin: Member of the trained population that each policy is; empty if it is none of them.
-
-    Example:
-        >>> policies = PolicySet.load("runs/mine/policies")  # doctest: +SKIP
-        >>> choice = policies.cater(segments, answers)  # doctest: +SKIP
-        >>> action = policies.act(observation, member=choice.member)  # doctest: +SKIP
+        origin: Member of the trained population that each one is; empty if it is none of them.
     """
+
+    folder: ClassVar[str]  #: of a run, in which it is kept
+    _kind: ClassVar[str]
+    _spec: ClassVar[type[PolicySpec] | type[RewardSpec]]
 
     def __init__(
         self, population: Population, *, alpha: float = 0.5, discount: float = 1.0
@@ -73,20 +71,20 @@ class PolicySet:
         *,
         alpha: float = 0.5,
         discount: float = 1.0,
-    ) -> "PolicySet":
+    ) -> Self:
         """Keep one member for each distinct behaviour (pass or not, on every comparison)."""
         passes = margins(population, bank, comparisons, alpha=alpha, discount=discount) > 0
         inverse = torch.unique(passes, dim=0, return_inverse=True)[1].tolist()
         first = sorted({behaviour: inverse.index(behaviour) for behaviour in inverse}.values())
-        policies = cls(population.subset(first), alpha=alpha, discount=discount)
-        policies.origin = first
-        return policies
+        kept = cls(population.subset(first), alpha=alpha, discount=discount)
+        kept.origin = first
+        return kept
 
     def __len__(self) -> int:
         return len(self.population)
 
     def effective_number(self, bank: SegmentBank, comparisons: Comparisons) -> float:
-        """How many clearly different policies there are, between 1 and ``len(self)``.
+        """How many clearly different hypotheses there are, between 1 and ``len(self)``.
 
         The similarity-sensitive diversity of order 2 (Leinster and Cobbold, 2012), ``1 / sum_ij
         p_i Z_ij p_j`` with equal shares p; two members are as similar as the agreement of their
@@ -96,9 +94,13 @@ class PolicySet:
         similarity = (sign @ sign.T / sign.shape[1]).clamp(min=0)
         return float(1 / similarity.mean())
 
+    @staticmethod
+    def _bank(segments: TensorDictBase) -> SegmentBank:
+        """Segments as hypotheses of this kind read them."""
+        return SegmentBank.from_segments(segments)
+
     def _margins(self, segments: TensorDictBase | SegmentBank, comparisons: Comparisons) -> Tensor:
-        known = isinstance(segments, SegmentBank)
-        bank = segments if known else SegmentBank.from_segments(segments)
+        bank = segments if isinstance(segments, SegmentBank) else self._bank(segments)
         device = self.population.device
         return margins(
             self.population,
@@ -107,6 +109,178 @@ class PolicySet:
             alpha=self.alpha,
             discount=self.discount,
         )
+
+    def cater(
+        self,
+        segments: TensorDictBase | SegmentBank,
+        answers: TensorDictBase,
+        *,
+        method: Literal["posterior", "lexicase"] = "posterior",
+        mistake: float = 0.05,
+        generator: torch.Generator | None = None,
+    ) -> Catered:
+        """Choose a hypothesis for one rater from a few answers.
+
+        Args:
+            segments: What the answers are about.
+            answers: TensorDict ``[K]`` with ``pair`` and ``answer``; ties and skips are ignored.
+            method: ``"posterior"``: belief ``w_n ~ prod_k p(answer_k | Delta_nk)`` with ``p = (1 -
+                mistake) sigmoid(Delta) + mistake sigmoid(-Delta)``, and the one believed in
+                most. ``"lexicase"``: one lexicase selection over the answers, as in the POPL
+                paper; needs ``generator``.
+            mistake: Chance of a slip, which keeps single answers from ruling a policy out.
+            generator: Source of the lexicase draw.
+
+        Raises:
+            ValueError: If no answer is strict, or the arguments are off.
+        """
+        comparisons = Comparisons.from_preferences(answers, cases="preference")
+        margin = self._margins(segments, comparisons).cpu()
+        if method == "posterior":
+            if not 0 <= mistake < 0.5:
+                raise ValueError(f"mistake must be in [0, 0.5), got {mistake}")
+            probability = (1 - mistake) * margin.sigmoid() + mistake * (-margin).sigmoid()
+            log_weight = probability.clamp(min=1e-12).log().sum(1)
+            return Catered(int(log_weight.argmax()), log_weight.softmax(0))
+        if method == "lexicase":
+            if generator is None:
+                raise ValueError("generator must be given for lexicase catering")
+            member = int(lexicase_selection(margin > 0, 1, generator=generator))
+            return Catered(member, F.one_hot(torch.tensor(member), len(self)).float())
+        raise ValueError(f"method must be 'posterior' or 'lexicase', got {method!r}")
+
+    def fair(
+        self,
+        segments: TensorDictBase | SegmentBank,
+        answers: TensorDictBase,
+        *,
+        quantile: float = 0.1,
+    ) -> int:
+        """The one hypothesis that does best by the raters it serves worst.
+
+        Args:
+            segments: What the answers are about.
+            answers: TensorDict ``[M]`` with ``pair``, ``answer`` and ``rater``.
+            quantile: Quantile over raters of its accuracy that is maximised; 0.1 as in the
+                POPL paper, 0 for the minimum.
+
+        Raises:
+            ValueError: If ``quantile`` is outside [0, 1] or no answer is strict.
+        """
+        if not 0 <= quantile <= 1:
+            raise ValueError(f"quantile must be in [0, 1], got {quantile}")
+        comparisons = Comparisons.from_preferences(answers, cases="rater")
+        values = case_values(self._margins(segments, comparisons).cpu() > 0, comparisons)
+        return int(values.quantile(quantile, dim=1).argmax())
+
+    def save(self, path: Path | str) -> None:
+        """Write the set as tensors and JSON; nothing is left half-written.
+
+        Raises:
+            FileExistsError: If ``path`` exists.
+        """
+        path = Path(path)
+        if path.exists():
+            raise FileExistsError(f"{path} exists; remove it or choose another path")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        beside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+        try:
+            whole = beside / "set"
+            whole.mkdir()
+            population = self.population
+            save_tensordict(population.members.data, whole / "members")
+            trunk = {name: value.tolist() for name, value in population.trunk.state_dict().items()}
+            about = {
+                "format": f"popl_rl.{self._kind}_set/1",
+                "members": len(self),
+                "spec": asdict(cast("PolicySpec | RewardSpec", population.spec)),
+                "evolve": population.evolve,
+                "alpha": self.alpha,
+                "discount": self.discount,
+                "origin": self.origin,
+                "trunk": trunk,
+            }
+            (whole / f"{self._kind}_set.json").write_text(json.dumps(about))
+            whole.rename(path)
+        finally:
+            shutil.rmtree(beside, ignore_errors=True)
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            FileNotFoundError: If there is no set of this kind at ``path``.
+            ValueError: If it is truncated, damaged, or something else.
+        """
+        path = Path(path)
+        about_path = path / f"{cls._kind}_set.json"
+        if not about_path.is_file():
+            raise FileNotFoundError(
+                f"no {cls._kind} set at {path}: expected the folder {cls.folder!r} of a finished "
+                "run"
+            )
+        try:
+            about = json.loads(about_path.read_text())
+            if about["format"] != f"popl_rl.{cls._kind}_set/1":
+                raise ValueError(f"unknown format {about['format']!r}")
+            spec = cls._spec(**{**about["spec"], "hidden": tuple(about["spec"]["hidden"])})
+            generator = torch.Generator().manual_seed(0)
+            networks = [build_network(spec, generator=generator) for _ in range(about["members"])]
+            population = Population(networks, spec, evolve=about["evolve"])
+            trunk = {name: torch.tensor(value) for name, value in about["trunk"].items()}
+            population.trunk.load_state_dict(trunk)
+            members = load_tensordict(path / "members")
+            expected = population.members.data
+            for key in expected.keys(True, True):
+                if members[key].shape != expected[key].shape:
+                    raise ValueError(f"{key} has shape {tuple(members[key].shape)}")
+            expected.update_(members)
+            loaded = cls(population, alpha=float(about["alpha"]), discount=float(about["discount"]))
+            loaded.origin = [int(member) for member in about["origin"]]
+        except (
+            AttributeError,
+            FileNotFoundError,
+            KeyError,
+            RuntimeError,
+            TypeError,
+            ValueError,
+        ) as error:
+            raise ValueError(
+                f"{path} is not readable as a {cls._kind} set ({error}); it is truncated or was "
+                "written by something else; train again or restore the folder"
+            ) from error
+        return loaded
+
+    def subset(self, members: Sequence[int]) -> Self:
+        """Some of them, in the given order."""
+        chosen = type(self)(
+            self.population.subset(members), alpha=self.alpha, discount=self.discount
+        )
+        chosen.origin = [self.origin[member] for member in members] if self.origin else []
+        return chosen
+
+
+class PolicySet(HypothesisSet):
+    """Policies of which every hidden group should find its own.
+
+    Args:
+        population: The policies.
+        alpha: Scale of their scores, as trained.
+        discount: Per-step discount of their scores.
+
+    Attributes:
+        origin: Member of the trained population that each policy is; empty if it is none of them.
+
+    Example:
+        >>> policies = PolicySet.load("runs/mine/policies")  # doctest: +SKIP
+        >>> choice = policies.cater(segments, answers)  # doctest: +SKIP
+        >>> action = policies.act(observation, member=choice.member)  # doctest: +SKIP
+    """
+
+    folder = "policies"
+    _kind = "policy"
+    _spec = PolicySpec
 
     @torch.no_grad()
     def act(
@@ -155,155 +329,58 @@ class PolicySet:
 
     def actor(self, member: int) -> ProbabilisticActor:
         """One policy as a TorchRL actor, for collectors and further training."""
-        return build_actor(self.population.spec, self.population.network(member))
-
-    def cater(
-        self,
-        segments: TensorDictBase | SegmentBank,
-        answers: TensorDictBase,
-        *,
-        method: Literal["posterior", "lexicase"] = "posterior",
-        mistake: float = 0.05,
-        generator: torch.Generator | None = None,
-    ) -> Catered:
-        """Choose a policy for one rater from a few answers.
-
-        Args:
-            segments: What the answers are about.
-            answers: TensorDict ``[K]`` with ``pair`` and ``answer``; ties and skips are ignored.
-            method: ``"posterior"``: belief ``w_n ~ prod_k p(answer_k | Delta_nk)`` with ``p = (1 -
-                mistake) sigmoid(Delta) + mistake sigmoid(-Delta)``, and the policy believed in
-                most. ``"lexicase"``: one lexicase selection over the answers, as in the POPL
-                paper; needs ``generator``.
-            mistake: Chance of a slip, which keeps single answers from ruling a policy out.
-            generator: Source of the lexicase draw.
-
-        Raises:
-            ValueError: If no answer is strict, or the arguments are off.
-        """
-        comparisons = Comparisons.from_preferences(answers, cases="preference")
-        margin = self._margins(segments, comparisons).cpu()
-        if method == "posterior":
-            if not 0 <= mistake < 0.5:
-                raise ValueError(f"mistake must be in [0, 0.5), got {mistake}")
-            probability = (1 - mistake) * margin.sigmoid() + mistake * (-margin).sigmoid()
-            log_weight = probability.clamp(min=1e-12).log().sum(1)
-            return Catered(int(log_weight.argmax()), log_weight.softmax(0))
-        if method == "lexicase":
-            if generator is None:
-                raise ValueError("generator must be given for lexicase catering")
-            member = int(lexicase_selection(margin > 0, 1, generator=generator))
-            return Catered(member, F.one_hot(torch.tensor(member), len(self)).float())
-        raise ValueError(f"method must be 'posterior' or 'lexicase', got {method!r}")
-
-    def fair(
-        self,
-        segments: TensorDictBase | SegmentBank,
-        answers: TensorDictBase,
-        *,
-        quantile: float = 0.1,
-    ) -> int:
-        """The one policy that does best by the raters it serves worst.
-
-        Args:
-            segments: What the answers are about.
-            answers: TensorDict ``[M]`` with ``pair``, ``answer`` and ``rater``.
-            quantile: Quantile over raters of a policy's accuracy that is maximised; 0.1 as in the
-                POPL paper, 0 for the minimum.
-
-        Raises:
-            ValueError: If ``quantile`` is outside [0, 1] or no answer is strict.
-        """
-        if not 0 <= quantile <= 1:
-            raise ValueError(f"quantile must be in [0, 1], got {quantile}")
-        comparisons = Comparisons.from_preferences(answers, cases="rater")
-        values = case_values(self._margins(segments, comparisons).cpu() > 0, comparisons)
-        return int(values.quantile(quantile, dim=1).argmax())
-
-    def save(self, path: Path | str) -> None:
-        """Write the set as tensors and JSON; nothing is left half-written.
-
-        Raises:
-            FileExistsError: If ``path`` exists.
-        """
-        path = Path(path)
-        if path.exists():
-            raise FileExistsError(f"{path} exists; remove it or choose another path")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
-        try:
-            whole = beside / "set"
-            whole.mkdir()
-            population = self.population
-            save_tensordict(population.members.data, whole / "members")
-            trunk = {name: value.tolist() for name, value in population.trunk.state_dict().items()}
-            about = {
-                "format": _FORMAT,
-                "members": len(self),
-                "spec": asdict(population.spec),
-                "evolve": population.evolve,
-                "alpha": self.alpha,
-                "discount": self.discount,
-                "origin": self.origin,
-                "trunk": trunk,
-            }
-            (whole / "policy_set.json").write_text(json.dumps(about))
-            whole.rename(path)
-        finally:
-            shutil.rmtree(beside, ignore_errors=True)
-
-    @classmethod
-    def load(cls, path: Path | str) -> "PolicySet":
-        """Read what :meth:`save` wrote.
-
-        Raises:
-            FileNotFoundError: If there is no policy set at ``path``.
-            ValueError: If it is truncated, damaged, or something else.
-        """
-        path = Path(path)
-        about_path = path / "policy_set.json"
-        if not about_path.is_file():
-            raise FileNotFoundError(
-                f"no policy set at {path}: expected the folder 'policies' of a finished run"
-            )
-        try:
-            about = json.loads(about_path.read_text())
-            if about["format"] != _FORMAT:
-                raise ValueError(f"unknown format {about['format']!r}")
-            spec = PolicySpec(**{**about["spec"], "hidden": tuple(about["spec"]["hidden"])})
-            generator = torch.Generator().manual_seed(0)
-            networks = [build_network(spec, generator=generator) for _ in range(about["members"])]
-            population = Population(networks, spec, evolve=about["evolve"])
-            trunk = {name: torch.tensor(value) for name, value in about["trunk"].items()}
-            population.trunk.load_state_dict(trunk)
-            members = load_tensordict(path / "members")
-            expected = population.members.data
-            for key in expected.keys(True, True):
-                if members[key].shape != expected[key].shape:
-                    raise ValueError(f"{key} has shape {tuple(members[key].shape)}")
-            expected.update_(members)
-            policies = cls(
-                population, alpha=float(about["alpha"]), discount=float(about["discount"])
-            )
-            policies.origin = [int(member) for member in about["origin"]]
-        except (
-            AttributeError,
-            FileNotFoundError,
-            KeyError,
-            RuntimeError,
-            TypeError,
-            ValueError,
-        ) as error:
-            raise ValueError(
-                f"{path} is not readable as a policy set ({error}); it is truncated or was "
-                "written by something else; train again or restore the folder"
-            ) from error
-        return policies
-
-    def subset(self, members: Sequence[int]) -> "PolicySet":
-        """Some of the policies, in the given order."""
-        policies = PolicySet(
-            self.population.subset(members), alpha=self.alpha, discount=self.discount
+        return build_actor(
+            cast("PolicySpec", self.population.spec), self.population.network(member)
         )
-        policies.origin = [self.origin[member] for member in members] if self.origin else []
-        return policies
+
+
+class RewardSet(HypothesisSet):
+    """Reward functions of which every hidden group should find its own.
+
+    Args:
+        population: The reward functions.
+        alpha: Scale of their scores, as trained.
+        discount: Per-step discount of their scores.
+
+    Attributes:
+        origin: Member of the trained population that each one is; empty if it is none of them.
+    """
+
+    folder = "rewards"
+    _kind = "reward"
+    _spec = RewardSpec
+
+    @staticmethod
+    def _bank(segments: TensorDictBase) -> SegmentBank:
+        return reward_bank(segments)
+
+    @torch.no_grad()
+    def reward(self, observation: Tensor) -> Tensor:
+        """Rewards of every discrete action in every member's eyes.
+
+        Args:
+            observation: ``[B, O]``; with the action behind it if actions are continuous.
+
+        Returns:
+            ``[N, B, K]``, in each member's own units: only differences within a member mean
+            something.
+        """
+        rewards: Tensor = self.population(observation)
+        return rewards
+
+
+def as_set(population: Population, *, alpha: float, discount: float = 1.0) -> HypothesisSet:
+    """A :class:`PolicySet` of policies, or a :class:`RewardSet` of reward functions."""
+    kind = PolicySet if isinstance(population.spec, PolicySpec) else RewardSet
+    return kind(population, alpha=alpha, discount=discount)
+
+
+def load_set(path: Path | str) -> HypothesisSet:
+    """Read a set of whichever kind is at ``path``.
+
+    Raises:
+        FileNotFoundError: If there is none.
+        ValueError: If it is truncated, damaged, or something else.
+    """
+    is_reward = (Path(path) / "reward_set.json").is_file()
+    return RewardSet.load(path) if is_reward else PolicySet.load(path)

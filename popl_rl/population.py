@@ -1,4 +1,4 @@
-"""N policies as one stack of parameters: score, clone, swap members in and out."""
+"""N policies, or reward functions, as one stack of parameters: score, clone, swap members."""
 
 from collections.abc import Iterator, Sequence
 from typing import Literal
@@ -7,14 +7,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from torch import Tensor, nn
 
-from popl_rl.policies import PolicySpec, build_network, log_prob
+from popl_rl.policies import Spec, build_network
 from popl_rl.segments import SegmentBank
 
 __all__ = ["Population", "segment_scores"]
 
 
 class Population(nn.Module):
-    """Stacked policies of one architecture.
+    """Stacked policies, or reward functions, of one architecture.
 
     The layers of the members are multiplied together (``baddbmm``), which on a CPU is as fast as
     a loop over the members and faster than ``torch.vmap``; on a GPU it is one kernel per layer.
@@ -36,7 +36,7 @@ class Population(nn.Module):
     def __init__(
         self,
         networks: Sequence[nn.Sequential],
-        spec: PolicySpec,
+        spec: Spec,
         *,
         evolve: Literal["all", "head"] = "all",
     ) -> None:
@@ -47,7 +47,7 @@ class Population(nn.Module):
         if len(kinds) > 1:
             raise ValueError(
                 f"networks must share one architecture, got {' and '.join(sorted(kinds))}; build "
-                "them all from one PolicySpec"
+                "them all from one spec"
             )
         if evolve not in ("all", "head"):
             raise ValueError(f"evolve must be 'all' or 'head', got {evolve!r}")
@@ -65,13 +65,13 @@ class Population(nn.Module):
     @classmethod
     def create(
         cls,
-        spec: PolicySpec,
+        spec: Spec,
         num_members: int,
         *,
         evolve: Literal["all", "head"] = "all",
         generator: torch.Generator,
     ) -> "Population":
-        """Build ``num_members`` freshly initialised policies."""
+        """Build ``num_members`` freshly initialised members."""
         if num_members < 1:
             raise ValueError(f"num_members must be at least 1, got {num_members}")
         networks = [build_network(spec, generator=generator) for _ in range(num_members)]
@@ -87,7 +87,7 @@ class Population(nn.Module):
         return device
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Logits or mean actions of every member.
+        """Logits, mean actions or rewards of every member.
 
         Args:
             observation: ``[R, O]`` seen by all members, or ``[N, R, O]``, each its own.
@@ -105,7 +105,11 @@ class Population(nn.Module):
                 hidden = activation(hidden)
                 continue
             layer = self.members[str(position)]
-            hidden = torch.baddbmm(layer["bias"].unsqueeze(1), hidden, layer["weight"].mT)
+            bias, weight = layer.get("bias", None), layer["weight"].mT
+            if bias is None:
+                hidden = torch.bmm(hidden, weight)
+            else:
+                hidden = torch.baddbmm(bias.unsqueeze(1), hidden, weight)
         return hidden
 
     @torch.no_grad()
@@ -153,8 +157,9 @@ def segment_scores(
 ) -> Tensor:
     """Score every segment once per member: ``S_n(sigma) = sum_t gamma^t alpha log pi_n(a_t|s_t)``.
 
-    The score inside the CPL loss (arXiv 2310.13639, equation 5). Observations that occur more than
-    once in the bank are looked at once.
+    The score inside the CPL loss (arXiv 2310.13639, equation 5); for reward functions the sum of
+    rewards, ``sum_t gamma^t alpha r_n(s_t, a_t)``. Observations that occur more than once in the
+    bank are looked at once.
 
     Args:
         population: N members.
@@ -173,18 +178,18 @@ def segment_scores(
     budget = int(memory_mb * 2**20)
     scores = torch.empty(count, len(bank), device=population.device)
     if spec.discrete and bank.is_shared:
-        # A table [N, U, K] of log-probabilities answers for every step of every segment.
+        # A table [N, U, K] of step scores answers for every step of every segment.
         member_bytes = 4 * (3 * width * len(bank.observation) + 4 * bank.row.numel())
         features = population.trunk(bank.observation)
         cell = (bank.row * spec.action_dim + bank.action).flatten()
         for part in _chunks(count, max(1, budget // member_bytes)):
             some = population.with_members(population.members.data[part])
-            table = some.from_features(features).log_softmax(-1).flatten(1)
+            table = spec.table(some.from_features(features)).flatten(1)
             scores[part] = table[:, cell].view(-1, *bank.row.shape) @ weight
         return scores
     for part in _chunks(len(bank), max(1, budget // (4 * 3 * width * steps * count))):
         observation = bank.observation[bank.row[part]].flatten(0, 1)
         action = bank.action[part].flatten(0, 1)
-        value = log_prob(spec, population(observation), action)
+        value = spec.step_scores(population(observation), action)
         scores[:, part] = value.view(count, -1, steps) @ weight
     return scores

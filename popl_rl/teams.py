@@ -24,8 +24,8 @@ from torch import Tensor
 from popl_rl.comparisons import Comparisons
 from popl_rl.lexicase import lexicase_report
 from popl_rl.losses import CPLLoss, linear_decay
-from popl_rl.policies import PolicySpec
-from popl_rl.policy_set import PolicySet
+from popl_rl.policies import Spec
+from popl_rl.policy_set import HypothesisSet, as_set
 from popl_rl.popl import mad, margins
 from popl_rl.population import Population
 from popl_rl.segments import SegmentBank
@@ -104,7 +104,7 @@ class TeamPOPL:
 
     def __init__(
         self,
-        spec: PolicySpec,
+        spec: Spec,
         bank: SegmentBank,
         comparisons: Comparisons,
         *,
@@ -175,7 +175,7 @@ class TeamPOPL:
             metrics["effective_parents"] = report.effective
         return metrics
 
-    def policies(self) -> PolicySet:
+    def policies(self) -> HypothesisSet:
         """Choose the smallest team as good as the best, and polish it."""
         _, robust = self._held_out()
         behind = robust[robust.mean(1).argmax()] - robust
@@ -189,7 +189,7 @@ class TeamPOPL:
         share = self.share[team][self.active[team]]
         return self._polish(self.population.subset(member), share)
 
-    def _polish(self, team: Population, share: Tensor) -> PolicySet:
+    def _polish(self, team: Population, share: Tensor) -> HypothesisSet:
         """Train a team on, with responsibilities that nobody gave to their own training data.
 
         ``folds + 1`` copies of the team train side by side. Copy f leaves fold f out and tells
@@ -221,7 +221,7 @@ class TeamPOPL:
                 _descend((F.softplus(-contrast) * weight).mean(1).sum(), optimizer)
             schedule.step()
         polished = copies.subset(list(range(settings.folds * size, len(copies))))
-        policies = PolicySet(polished, alpha=settings.polish_alpha, discount=self.discount)
+        policies = as_set(polished, alpha=settings.polish_alpha, discount=self.discount)
         policies.origin = []  # trained on, they are no longer members of the population
         return policies
 
@@ -325,7 +325,7 @@ class TeamPOPL:
             better, worse = loss.scores(segment).chunk(2, dim=1)
             return better - self.settings.conservatism * worse
         # All members see the same batch of few distinct observations: one matrix product.
-        table = loss.population(self.bank.observation).log_softmax(-1).flatten(1)
+        table = self.spec.table(loss.population(self.bank.observation)).flatten(1)
         contrast = self._counts[preferred] - self.settings.conservatism * self._counts[other]
         batch: Tensor = loss.alpha * table @ contrast.T
         return batch
@@ -364,7 +364,7 @@ class TeamPOPL:
         self.generator.set_state(state["generator"].cpu())
 
 
-def _visit_counts(bank: SegmentBank, spec: PolicySpec, discount: float) -> Tensor | None:
+def _visit_counts(bank: SegmentBank, spec: Spec, discount: float) -> Tensor | None:
     """Discounted visits of each segment to each (observation, action), ``[N, U * K]``."""
     if not (bank.is_shared and spec.discrete):
         return None

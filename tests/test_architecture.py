@@ -35,6 +35,7 @@ LEARNERS = [
         "policies",
         "popl",
         "population",
+        "rewards",
         "teams",
         "variation",
     )
@@ -42,7 +43,7 @@ LEARNERS = [
 #: A module of one layer imports modules of earlier layers, or of its own.
 LAYERS = (
     {"keys", "registry", "config", "lexicase", "_pools", "downsampling", "planning"},
-    {"raters", "rollouts", "segments", "policies", "comparisons"},
+    {"raters", "rollouts", "segments", "policies", "rewards", "comparisons"},
     {"preferences", "losses", "population", "variation"},
     {"popl", "policy_set", "teams", "evaluation", "baselines", "_env_checks", "testing"},
     {"experiment", "results", "loggers", "plots", "report", "pictures", "runs", "trainer"},
