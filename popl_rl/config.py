@@ -73,15 +73,18 @@ class MethodConfig:
     """How the policies are learnt."""
 
     name: str = "popl"
+    learns: str = "auto"  # policy, reward; auto: reward where there is nothing to do but judge
     cases: str = "rater"  # what lexicase filters on: rater (needs rater ids) or preference
     variation: str = "auto"  # gradient, gaussian (published), teams; auto goes by the cases
-    evolve: str = "all"  # all: whole networks; head: last layers on a shared trunk
+    evolve: str = "all"  # all: whole networks; head: last layers on a shared, frozen trunk
+    features: str = "random"  # that trunk: random (published), or pooled: trained on all answers
+    feature_steps: int = 500  # steps of that training (pooled)
     members: int = 32  # policies in the population
     generations: int = 100
     hidden: list[int] = field(default_factory=lambda: [64, 64])  # units of each hidden layer
     epsilon: str | None = "mad"  # tolerance of lexicase: mad, a number, or null for none
     alpha: float = 0.5  # scale of the scores (CPL's temperature)
-    conservatism: float = 0.9  # lambda of the CPL loss, in (0, 1]
+    conservatism: float = 0.9  # lambda of the CPL loss, in (0, 1]; 1 for reward functions
     discount: float = 1.0  # per-step discount of the scores
     warm_up: int = 20  # pooled CPL steps before the first generation
     steps: int = 15  # CPL steps of each child (gradient)
@@ -100,13 +103,20 @@ class EvaluationConfig:
     new_raters: int = 20  # new raters of each group that the set is catered to
     answers: int = 20  # answers of each of them
     pairs: int = 4000  # fresh pairs per group for accuracies
+    menu: int = 10  # items that a reward function chooses from, where there is nothing to do
+    optimiser: str = "auto"  # how reward functions act: plan, ppo; auto: plan if there is a table
+    ppo_frames: int = 100_000  # frames of PPO for each of them
     greedy: bool = False  # most likely actions instead of sampled ones
     baselines: bool = True  # train pooled CPL and the oracle too
+    baselines_from: str | None = None  # folder 'baselines' of a run on the same data; not trained
+    reward_baselines: bool = True  # B-REX and DPL too, where items are judged
+    brex_steps: int = 10_000  # steps of B-REX's chain
+    dpl_steps: int = 500  # steps of DPL's training
     baseline_steps: int = 1500  # CPL steps of these
     baseline_batch_size: int = 256  # preferences per step of these
     baseline_learning_rate: float = 2e-3  # of their Adam
     baseline_alpha: float = 0.5  # scale of their scores
-    baseline_conservatism: float = 0.9  # lambda of their CPL loss
+    baseline_conservatism: float = 0.9  # lambda of their CPL loss; 1 for reward functions
     history: int = 10  # generations between two snapshots for the pictures; 0 for none
 
 
@@ -184,7 +194,15 @@ def validate(config: Config) -> None:
     at_least_one(evaluation, "evaluation", "episodes", "new_raters", "answers", "pairs")
     at_least_one(evaluation, "evaluation", "baseline_steps", "baseline_batch_size")
     at_least_one(method, "method", "generations", "steps", "batch_size")
-    at_least_one(method, "method", "teams", "team_generations")
+    at_least_one(method, "method", "teams", "team_generations", "feature_steps")
+    at_least_one(evaluation, "evaluation", "ppo_frames", "brex_steps", "dpl_steps")
+    expect(evaluation.menu >= 2, "evaluation.menu", "at least 2, to choose", evaluation.menu)
+    for name, value, known in (
+        ("evaluation.optimiser", evaluation.optimiser, ("auto", "plan", "ppo")),
+        ("method.learns", method.learns, ("auto", "policy", "reward")),
+        ("method.features", method.features, ("random", "pooled")),
+    ):
+        expect(value in known, name, ", ".join(known), value)
     expect(data.segments >= 2, "data.segments", "at least 2, to compare", data.segments)
     expect(bool(raters.groups), "raters.groups", "one or more rater references", raters.groups)
     repeated = len(set(raters.groups)) < len(raters.groups)
@@ -243,6 +261,10 @@ def validate(config: Config) -> None:
         "at least 1",
         config.checkpoint_interval,
     )
+    if evaluation.baselines_from is not None:
+        found = Path(evaluation.baselines_from).is_dir()
+        expected = "the folder 'baselines' of an earlier run"
+        expect(found, "evaluation.baselines_from", expected, evaluation.baselines_from)
     if data.load is not None:
         found = (Path(data.load) / "segments").is_dir()
         expect(found, "data.load", "the folder 'data' of an earlier run", data.load)

@@ -28,7 +28,7 @@ __all__ = [
 
 def roll_out(
     make_env: Callable[[], gymnasium.Env[Any, Any]],
-    policies: PolicySet | None,
+    policies: PolicySet | Tensor | None,
     *,
     episodes: int,
     max_steps: int,
@@ -40,7 +40,8 @@ def roll_out(
 
     Args:
         make_env: Builds one environment.
-        policies: P policies; None to roll ``random_action`` instead, as one policy.
+        policies: P policies, or tables ``[P, S, A]`` of action probabilities in each state
+            (``("info", "next_state")``); None to roll ``random_action`` instead, as one policy.
         episodes: Episodes E per policy; episode e starts from the same seed for all policies.
         max_steps: Steps H after which an episode is cut.
         seed: Seed of the starts and of the sampled actions.
@@ -57,12 +58,18 @@ def roll_out(
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     if policies is None and random_action is None:
         raise ValueError("random_action must be given to roll without policies, got None")
-    device = torch.device("cpu") if policies is None else policies.population.device
+    device = torch.device("cpu")
+    if isinstance(policies, PolicySet):
+        device = policies.population.device
     generator = torch.Generator(device).manual_seed(seed)
     starts = torch.randint(2**31, (episodes,), generator=generator, device=device).tolist()
     count = 1 if policies is None else len(policies)
 
     def act(step: TensorDictBase) -> Tensor:
+        if isinstance(policies, Tensor):
+            state = step[INFO, "next_state"].long().view(count, episodes)
+            rows = policies[torch.arange(count).unsqueeze(1), state].flatten(0, 1)
+            return torch.multinomial(rows, 1, generator=generator).squeeze(-1)
         if policies is not None:
             observation = step[OBSERVATION].view(count, episodes, -1).to(device)
             action = policies.act(observation, greedy=greedy, generator=generator)

@@ -1,61 +1,61 @@
 """From a configuration to the objects of a run. Configuration objects go no further than here."""
 
-import fnmatch
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import gymnasium
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
+from popl_rl.baselines import group_weights, train_cpl
 from popl_rl.comparisons import Comparisons
-from popl_rl.config import DataConfig, EnvConfig, MethodConfig, RatersConfig, parse_epsilon
-from popl_rl.keys import ACTION, GROUP, INFO, OBSERVATION
+from popl_rl.config import (
+    DataConfig,
+    EvaluationConfig,
+    MethodConfig,
+    RatersConfig,
+    parse_epsilon,
+)
+from popl_rl.keys import ACTION, ANSWER, GROUP, INFO, OBSERVATION, Answer
 from popl_rl.losses import CPLLoss
-from popl_rl.planning import Table
-from popl_rl.policies import PolicySpec
-from popl_rl.policy_set import PolicySet
+from popl_rl.policies import PolicySpec, build_network
+from popl_rl.policy_set import HypothesisSet, as_set, load_set
 from popl_rl.popl import POPL
 from popl_rl.population import Population
 from popl_rl.preferences import collect_preferences, load_preferences
 from popl_rl.raters import RaterGroup, Raters, Response, make_groups
-from popl_rl.registry import resolve
+from popl_rl.rewards import RewardSpec, reward_bank
 from popl_rl.segments import (
-    Behaviour,
     SegmentBank,
     collect_segments,
     load_tensordict,
-    random_behaviour,
     save_tensordict,
     segment_buffer,
     stored_segments,
-    table_behaviour,
 )
 from popl_rl.teams import TeamPOPL, TeamSettings
 from popl_rl.variation import GaussianHead, GradientCPL
+from popl_rl.worlds import World, has_nothing_to_do
 
 __all__ = [
     "Data",
-    "World",
-    "behaviour_shares",
+    "build_bank",
     "build_groups",
     "build_popl",
-    "build_world",
-    "final_policies",
+    "build_spec",
+    "final_set",
+    "fresh_segments",
     "generations_of",
     "make_data",
     "stream",
+    "train_baselines",
     "variation_of",
 ]
-
-MakeEnv = Callable[[], gymnasium.Env[Any, Any]]
 
 
 def stream(seed: int, name: str, device: torch.device | str = "cpu") -> torch.Generator:
@@ -64,105 +64,6 @@ def stream(seed: int, name: str, device: torch.device | str = "cpu") -> torch.Ge
     Each purpose has its own, so that asking for more of one thing changes nothing else.
     """
     return torch.Generator(device).manual_seed(zlib.crc32(f"{seed}/{name}".encode()))
-
-
-@dataclass(frozen=True)
-class World:
-    """An environment and what it offers.
-
-    Attributes:
-        make: Builds an environment to act in.
-        make_for_data: Builds an environment to collect segments in.
-        env: One environment, for its spaces and its picture.
-        behaviours: What the data shows.
-        shares: Share of each behaviour in the data.
-        table: Exact model, if the environment exposes one.
-    """
-
-    make: MakeEnv
-    make_for_data: MakeEnv
-    env: gymnasium.Env[Any, Any]
-    behaviours: Mapping[str, Behaviour]
-    shares: Mapping[str, float]
-    table: Table | None
-
-
-def build_world(config: EnvConfig) -> World:
-    """Resolve an environment and read off what it offers.
-
-    An environment is any Gymnasium environment. Two methods are used if it has them:
-    ``transition_table()`` (exact regret labels) and ``behaviours()`` (what the data shows: by
-    name, tables ``[S, A]`` of action probabilities or functions; uniformly random otherwise).
-
-    Raises:
-        ValueError: If the environment cannot be resolved or built, or ``mixture`` names behaviours
-            that it does not have.
-        TypeError: If it has no behaviours and its actions cannot be drawn at random, see
-            :func:`~popl_rl.segments.random_behaviour`.
-    """
-    factory = cast("Callable[..., gymnasium.Env[Any, Any]]", resolve("env", config.factory))
-    leading = () if config.id is None else (config.id,)
-
-    def build(options: dict[str, Any]) -> gymnasium.Env[Any, Any]:
-        try:
-            env = factory(*leading, **options)
-        except (TypeError, gymnasium.error.Error) as error:
-            raise ValueError(
-                f"env.factory {config.factory!r} cannot be built with id {config.id!r} and options "
-                f"{options}: {error}"
-            ) from error
-        if not isinstance(env, gymnasium.Env):
-            raise ValueError(
-                f"env.factory {config.factory!r} must return a gymnasium.Env, got {type(env)}"
-            )
-        if isinstance(env.action_space, gymnasium.spaces.Box):
-            # A Gaussian policy's mean knows no bounds. Gymnasium's own ClipAction would hide the
-            # bounds, which random actions need.
-            clip = partial(np.clip, a_min=env.action_space.low, a_max=env.action_space.high)
-            env = gymnasium.wrappers.TransformAction(env, clip, env.action_space)
-        return env
-
-    def make() -> gymnasium.Env[Any, Any]:
-        return build(dict(config.options))
-
-    def make_for_data() -> gymnasium.Env[Any, Any]:
-        return build({**config.options, **config.data_options})
-
-    env = make()
-    inner = env.unwrapped
-    table = inner.transition_table() if hasattr(inner, "transition_table") else None
-    given = inner.behaviours() if hasattr(inner, "behaviours") else {}
-    behaviours = {
-        name: table_behaviour(what) if isinstance(what, Tensor) else what
-        for name, what in given.items()
-    } or {"random": random_behaviour(env.action_space)}
-    shares = behaviour_shares(list(behaviours), config.mixture)
-    return World(make, make_for_data, env, behaviours, shares, table)
-
-
-def behaviour_shares(names: Sequence[str], mixture: Mapping[str, float] | None) -> dict[str, float]:
-    """Share of each behaviour in the data.
-
-    Args:
-        names: Behaviours that there are.
-        mixture: Shares by name or by pattern (``"planner/*"``), which the matching behaviours
-            divide equally; None for equal shares of all.
-
-    Raises:
-        ValueError: If a pattern matches nothing.
-    """
-    if mixture is None:
-        return dict.fromkeys(names, 1 / len(names))
-    shares = dict.fromkeys(names, 0.0)
-    for pattern, share in mixture.items():
-        matching = fnmatch.filter(names, pattern)
-        if not matching:
-            raise ValueError(
-                f"env.mixture {pattern!r} matches no behaviour; there are {', '.join(names)}"
-            )
-        for name in matching:
-            shares[name] += share / len(matching)
-    return shares
 
 
 def build_groups(config: RatersConfig, world: World) -> tuple[RaterGroup, ...]:
@@ -282,9 +183,44 @@ def make_data(
     return Data(buffer, preferences, worth)
 
 
+def fresh_segments(config: DataConfig, world: World, *, seed: int, max_steps: int) -> TensorDict:
+    """As many segments as were collected for training, that nobody has seen."""
+    return collect_segments(
+        world.make_for_data,
+        world.behaviours,
+        num_segments=config.segments,
+        length=config.length,
+        generator=stream(seed, "fresh segments"),
+        shares=world.shares,
+        max_steps=max_steps,
+    )
+
+
+def build_spec(config: MethodConfig, env: gymnasium.Env[Any, Any]) -> PolicySpec | RewardSpec:
+    """Sizes of the hypotheses: policies, or reward functions.
+
+    Raises:
+        ValueError: If policies are asked for where there is nothing to do.
+    """
+    if config.learns == "policy" and has_nothing_to_do(env):
+        raise ValueError(
+            "method.learns must be reward in an environment with a single action, got 'policy'"
+        )
+    if config.learns == "reward" or has_nothing_to_do(env):
+        return RewardSpec.from_env(env, hidden=config.hidden)
+    return PolicySpec.from_env(env, hidden=config.hidden)
+
+
+def build_bank(segments: TensorDictBase, spec: PolicySpec | RewardSpec) -> SegmentBank:
+    """Segments as these hypotheses read them."""
+    if isinstance(spec, RewardSpec):
+        return reward_bank(segments)
+    return SegmentBank.from_segments(segments)
+
+
 def build_popl(
     config: MethodConfig,
-    spec: PolicySpec,
+    spec: PolicySpec | RewardSpec,
     bank: SegmentBank,
     comparisons: Comparisons,
     *,
@@ -294,19 +230,23 @@ def build_popl(
 
     ``variation: auto`` means gradient variation for rater cases and teams for preference cases.
     """
+    # Conservatism keeps policies near the data; of reward functions only differences matter.
+    conservatism = config.conservatism if isinstance(spec, PolicySpec) else 1.0
     if variation_of(config) == "teams":
         settings = TeamSettings(
             teams=config.teams,
             generations=config.team_generations,
             alpha=config.alpha,
-            conservatism=config.conservatism,
+            conservatism=conservatism,
             discount=config.discount,
             learning_rate=config.learning_rate,
         )
         return TeamPOPL(spec, bank, comparisons, settings=settings, generator=generator)
-    population = Population.create(
-        spec, config.members, evolve=cast("Any", config.evolve), generator=generator
-    ).to(bank.row.device)
+    networks = [build_network(spec, generator=generator) for _ in range(config.members)]
+    if config.evolve == "head" and config.features == "pooled":
+        networks[0] = _pooled_network(config, spec, bank, comparisons, generator=generator)
+    population = Population(networks, spec, evolve=cast("Any", config.evolve))
+    population = population.to(bank.row.device)
     if variation_of(config) == "gaussian":
         variation: GaussianHead | GradientCPL = GaussianHead(
             population, std=config.mutation_std, generator=generator
@@ -316,7 +256,7 @@ def build_popl(
             population,
             bank,
             alpha=config.alpha,
-            conservatism=config.conservatism,
+            conservatism=conservatism,
             discount=config.discount,
         )
         variation = GradientCPL(
@@ -341,6 +281,29 @@ def build_popl(
     )
 
 
+def _pooled_network(
+    config: MethodConfig,
+    spec: PolicySpec | RewardSpec,
+    bank: SegmentBank,
+    comparisons: Comparisons,
+    *,
+    generator: torch.Generator,
+) -> torch.nn.Sequential:
+    """A network trained on everybody's answers, whose trunk is worth sharing."""
+    pooled = train_cpl(
+        spec,
+        bank,
+        comparisons,
+        torch.ones(1, len(comparisons), device=bank.row.device),
+        steps=config.feature_steps,
+        alpha=config.alpha,
+        conservatism=config.conservatism if isinstance(spec, PolicySpec) else 1.0,
+        discount=config.discount,
+        generator=generator,
+    )
+    return pooled.population.network(0).cpu()
+
+
 def variation_of(config: MethodConfig) -> str:
     """The kind of variation that ``auto`` stands for, or the one that was asked for."""
     if config.variation != "auto":
@@ -353,10 +316,71 @@ def generations_of(config: MethodConfig) -> int:
     return config.team_generations if variation_of(config) == "teams" else config.generations
 
 
-def final_policies(popl: POPL | TeamPOPL) -> PolicySet:
-    """The policy set that a finished run has found."""
+def final_set(popl: POPL | TeamPOPL) -> HypothesisSet:
+    """The policies, or reward functions, that a finished run has found."""
     if isinstance(popl, TeamPOPL):
         return popl.policies()
-    return PolicySet.distinct(
-        popl.population, popl.bank, popl.comparisons, alpha=popl.alpha, discount=popl.discount
+    everybody = as_set(popl.population, alpha=popl.alpha, discount=popl.discount)
+    return everybody.distinct(popl.bank, popl.comparisons)
+
+
+def train_baselines(
+    config: EvaluationConfig,
+    spec: PolicySpec | RewardSpec,
+    bank: SegmentBank,
+    comparisons: Comparisons,
+    preferences: TensorDictBase,
+    *,
+    num_groups: int,
+    generator: torch.Generator,
+    progress: Callable[[int], None] | None = None,
+) -> HypothesisSet:
+    """Train one hypothesis on everybody's answers and an oracle for each group, or load them.
+
+    Args:
+        config: How to train, or what to load.
+        spec: Sizes of the hypotheses.
+        bank: Segments.
+        comparisons: The strict ones among ``preferences``.
+        preferences: With the hidden groups, which oracles are told.
+        num_groups: Number of groups G.
+        generator: Source of initial weights and batches.
+        progress: Called with the number of steps done.
+
+    Returns:
+        ``1 + G`` hypotheses.
+
+    Raises:
+        ValueError: If the groups are unknown, some group has no strict answer, or what is loaded
+            does not fit.
+    """
+    if config.baselines_from is not None:
+        loaded = load_set(config.baselines_from)
+        if len(loaded) != 1 + num_groups or loaded.population.spec != spec:
+            raise ValueError(
+                f"evaluation.baselines_from: {config.baselines_from} holds {len(loaded)} of "
+                f"{loaded.population.spec}, expected {1 + num_groups} of {spec}; name a run on the "
+                "same data"
+            )
+        loaded.population.to(bank.row.device)
+        return loaded
+    if GROUP not in preferences.keys(True):
+        raise ValueError(
+            "the loaded preferences name no hidden groups, which the oracle needs; set "
+            "evaluation.baselines=false"
+        )
+    strict = preferences[ANSWER] <= Answer.SECOND
+    weight = group_weights(preferences[GROUP][strict], num_groups)
+    return train_cpl(
+        spec,
+        bank,
+        comparisons,
+        weight.to(bank.row.device),
+        steps=config.baseline_steps,
+        batch_size=config.baseline_batch_size,
+        learning_rate=config.baseline_learning_rate,
+        alpha=config.baseline_alpha,
+        conservatism=config.baseline_conservatism if isinstance(spec, PolicySpec) else 1.0,
+        generator=generator,
+        progress=progress,
     )

@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
 from popl_rl import plots
-from popl_rl.experiment import World
 from popl_rl.keys import INFO
-from popl_rl.policy_set import PolicySet
+from popl_rl.policy_set import HypothesisSet
 from popl_rl.results import Judge, Scoreboard
+from popl_rl.reward_baselines import Rivals
+from popl_rl.reward_pictures import draw_rewards
 from popl_rl.rollouts import MASK
+from popl_rl.worlds import World
 
 __all__ = ["draw", "occupancy_map"]
 
@@ -38,12 +40,13 @@ def occupancy_map(episodes: TensorDictBase, cells: torch.Tensor) -> NDArray[np.f
 
 def draw(
     run_dir: Path,
-    policies: PolicySet,
-    baselines: PolicySet | None,
+    found: HypothesisSet,
+    baselines: HypothesisSet | None,
     *,
     board: Scoreboard,
     judge: Judge,
     world: World,
+    rivals: Rivals | None = None,
 ) -> dict[str, Path]:
     """Draw every picture that the run has the data for, into ``run_dir/figures``.
 
@@ -83,9 +86,7 @@ def draw(
             snapshots.generation.tolist(),
             names,
             catered={
-                name: policies.origin[index]
-                for name, index in board.catered.items()
-                if policies.origin
+                name: found.origin[index] for name, index in board.catered.items() if found.origin
             },
             pooled=pooled,
             oracle=oracle,
@@ -97,7 +98,9 @@ def draw(
             for name in names
         }
         if baselines is not None:
-            maps["pooled CPL"] = occupancy_map(board.episodes["cpl", names[0]], cells)
+            pooled_name = "cpl" if ("cpl", names[0]) in board.episodes else "bradley_terry"
+            title = plots.method_name(pooled_name)
+            maps[title] = occupancy_map(board.episodes[pooled_name, names[0]], cells)
         figures["occupancy"] = plots.occupancy(
             picture(world),
             maps,
@@ -105,6 +108,7 @@ def draw(
             caption="Each rater group gets its own policy from the set; pooled CPL is one policy "
             "for everybody.",
         )
+    figures |= draw_rewards(found, baselines, board=board, judge=judge, rivals=rivals)
     paths = {}
     for name, figure in figures.items():
         paths[name] = folder / f"{name}.png"

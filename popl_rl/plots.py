@@ -52,6 +52,13 @@ METHODS = {
     "popl": "POPL (catered)",
     "popl_lexicase": "POPL (catered by lexicase)",
     "cpl": "CPL on everybody's answers",
+    "bradley_terry": "Bradley–Terry on everybody's answers",
+    "brex": "B-REX (catered)",
+    "brex_lexicase": "B-REX (catered by lexicase)",
+    "dpl_mean_variance": "DPL, mean and variance",
+    "dpl_mean_variance_risk_averse": "DPL, mean and variance, risk-averse",
+    "dpl_categorical": "DPL, categorical",
+    "dpl_categorical_risk_averse": "DPL, categorical, risk-averse",
     "oracle": "oracle (told the groups)",
     "random": "random actions",
 }
@@ -61,6 +68,7 @@ _METHOD_COLOURS = {
     "popl": PALETTE["blue"],
     "popl_lexicase": PALETTE["sky"],
     "cpl": PALETTE["orange"],
+    "bradley_terry": PALETTE["orange"],
     "oracle": PALETTE["black"],
     "random": PALETTE["grey"],
 }

@@ -4,7 +4,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import ClassVar, Literal, Self, cast
 
@@ -62,23 +62,12 @@ class HypothesisSet:
         self.discount = discount
         self.origin = list(range(len(population)))
 
-    @classmethod
-    def distinct(
-        cls,
-        population: Population,
-        bank: SegmentBank,
-        comparisons: Comparisons,
-        *,
-        alpha: float = 0.5,
-        discount: float = 1.0,
-    ) -> Self:
+    def distinct(self, bank: SegmentBank, comparisons: Comparisons) -> Self:
         """Keep one member for each distinct behaviour (pass or not, on every comparison)."""
-        passes = margins(population, bank, comparisons, alpha=alpha, discount=discount) > 0
+        passes = self._margins(bank, comparisons) > 0
         inverse = torch.unique(passes, dim=0, return_inverse=True)[1].tolist()
         first = sorted({behaviour: inverse.index(behaviour) for behaviour in inverse}.values())
-        kept = cls(population.subset(first), alpha=alpha, discount=discount)
-        kept.origin = first
-        return kept
+        return self.subset(first)
 
     def __len__(self) -> int:
         return len(self.population)
@@ -101,6 +90,12 @@ class HypothesisSet:
 
     def _margins(self, segments: TensorDictBase | SegmentBank, comparisons: Comparisons) -> Tensor:
         bank = segments if isinstance(segments, SegmentBank) else self._bank(segments)
+        pair = torch.stack([comparisons.preferred, comparisons.other])
+        if pair.numel() < len(bank):
+            # A few answers are about a few segments: score no others.
+            used, pair = pair.unique(return_inverse=True)
+            bank = bank.subset(used)
+            comparisons = replace(comparisons, preferred=pair[0], other=pair[1])
         device = self.population.device
         return margins(
             self.population,

@@ -177,6 +177,8 @@ def _rows(results: pd.DataFrame) -> Iterator[list[str]]:
         for group in of_method["group"].unique():
             of_group = of_method[of_method["group"] == group]
             values = {name: rows["value"] for name, rows in of_group.groupby("measure")}
+            if not set(values) & set(_MEASURES):
+                continue
             cells = [_cell(name, values.get(name, pd.Series(dtype=float))) for name in _MEASURES]
             yield [method_name(method), str(group), *cells]
 

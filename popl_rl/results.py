@@ -8,7 +8,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from popl_rl.config import EnvConfig, EvaluationConfig
+from popl_rl.acting import Acting, Choosing, Optimising, Planning, Rolling
+from popl_rl.config import Config, EnvConfig, EvaluationConfig
 from popl_rl.evaluation import (
     group_accuracy,
     group_returns,
@@ -16,16 +17,19 @@ from popl_rl.evaluation import (
     info_rates,
     new_rater_answers,
     recovery,
-    roll_out,
     success_rate,
 )
-from popl_rl.experiment import World, stream
-from popl_rl.policy_set import PolicySet
+from popl_rl.experiment import Data, build_bank, fresh_segments, stream
+from popl_rl.policies import PolicySpec
+from popl_rl.policy_set import HypothesisSet, PolicySet
 from popl_rl.population import segment_scores
 from popl_rl.raters import RaterGroup
-from popl_rl.segments import SegmentBank, random_behaviour
+from popl_rl.reward_baselines import Rivals
+from popl_rl.rewards import RewardSpec
+from popl_rl.segments import SegmentBank
+from popl_rl.worlds import World, has_nothing_to_do
 
-__all__ = ["Judge", "Scoreboard"]
+__all__ = ["Judge", "Scoreboard", "make_judge"]
 
 
 @dataclass(frozen=True)
@@ -50,21 +54,21 @@ class Scoreboard:
 
 
 class Judge:
-    """Judges policies by what every hidden group wants; reads what no learner may.
+    """Judges hypotheses by what every hidden group wants; reads what no learner may.
 
     Args:
-        world: Where to roll out.
-        env: Episode length, and which infos mean success and doors.
-        config: How many episodes, answers and pairs.
+        acting: Shows what hypotheses do.
+        env: Which infos mean success and doors.
+        config: How many answers, raters and pairs.
         groups: G groups.
-        bank: The stored segments.
+        bank: Segments to judge on.
         worth: Worth of each segment to each group, ``[G, N]``.
         seed: Seed of the run.
     """
 
     def __init__(
         self,
-        world: World,
+        acting: Acting,
         env: EnvConfig,
         config: EvaluationConfig,
         groups: Sequence[RaterGroup],
@@ -73,7 +77,7 @@ class Judge:
         *,
         seed: int,
     ) -> None:
-        self.world, self.env, self.config = world, env, config
+        self.acting, self.env, self.config = acting, env, config
         self.groups, self.bank, self.worth = groups, bank, worth
         self.seed = seed
         generator = stream(seed, "held-out pairs")
@@ -82,23 +86,23 @@ class Judge:
             for index in range(len(groups))
         }
 
-    def accuracy(self, policies: PolicySet) -> Tensor:
-        """Accuracy of every policy on every group's held-out pairs, ``[P, G]``."""
+    def accuracy(self, hypotheses: HypothesisSet) -> Tensor:
+        """Accuracy of every hypothesis on every group's held-out pairs, ``[P, G]``."""
         scores = segment_scores(
-            policies.population, self.bank, alpha=policies.alpha, discount=policies.discount
+            hypotheses.population, self.bank, alpha=hypotheses.alpha, discount=hypotheses.discount
         )
         return group_accuracy(scores.cpu(), self.pairs)
 
-    def snapshot(self, policies: PolicySet) -> dict[str, float]:
-        """Accuracy of every policy on every group, flat: ``{"<group>/<policy>": value}``."""
-        columns = self.accuracy(policies).T.tolist()
+    def snapshot(self, hypotheses: HypothesisSet) -> dict[str, float]:
+        """Accuracy of every hypothesis on every group, flat: ``{"<group>/<member>": value}``."""
+        columns = self.accuracy(hypotheses).T.tolist()
         return {
-            f"{group.name}/{policy}": value
+            f"{group.name}/{member}": value
             for group, column in zip(self.groups, columns, strict=True)
-            for policy, value in enumerate(column)
+            for member, value in enumerate(column)
         }
 
-    def cater(self, policies: PolicySet, method: str) -> Tensor:
+    def cater(self, hypotheses: HypothesisSet, method: str) -> Tensor:
         """Member given to each of several new raters of each group, ``[G, raters]``."""
         picks = []
         for index in range(len(self.groups)):
@@ -113,7 +117,7 @@ class Judge:
                     answers=self.config.answers,
                     generator=generator,
                 )
-                choice = policies.cater(
+                choice = hypotheses.cater(
                     self.bank,
                     answers,
                     method=method,  # type: ignore[arg-type]
@@ -122,79 +126,141 @@ class Judge:
                 picks.append(choice.member)
         return torch.tensor(picks).view(len(self.groups), -1)
 
-    def roll_out(self, policies: PolicySet | None) -> TensorDict:
-        """Episodes of every policy, or of the uniformly random one, ``[P, E, H]``."""
-        return roll_out(
-            self.world.make,
-            policies,
-            episodes=self.config.episodes,
-            max_steps=self.env.max_steps,
-            seed=self.seed,
-            greedy=self.config.greedy,
-            random_action=random_behaviour(self.world.env.action_space),
-        )
-
-    def score(self, policies: PolicySet, baselines: PolicySet | None) -> Scoreboard:
+    def score(
+        self,
+        hypotheses: HypothesisSet,
+        baselines: HypothesisSet | None,
+        *,
+        rivals: Rivals | None = None,
+    ) -> Scoreboard:
         """Fill the scoreboard.
 
         Args:
-            policies: The policy set.
-            baselines: Pooled CPL, then one oracle per group; None to leave them, and with them
-                ``recovery``, out.
+            hypotheses: The set that POPL found.
+            baselines: One trained on everybody's answers, then one oracle per group; None to leave
+                them, and with them ``recovery``, out.
+            rivals: Other learners of reward functions, for :class:`~popl_rl.acting.Choosing` alone.
         """
-        rows: list[tuple[str, str, str, float]] = []
-        episodes: dict[tuple[str, str], TensorDict] = {}
-        rolled_random = self.roll_out(None)
-        random = group_returns(rolled_random, self.groups)[0]
-        oracle = torch.full_like(random, float("nan"))
-        base = None if baselines is None else self.roll_out(baselines)
-        if base is not None:
-            oracle = group_returns(base[1:], self.groups).diagonal()
-
-        def add(method: str, index: int, rolled: TensorDict, share: Tensor) -> None:
-            """Rows of one method and group: rolled policies, weighted by ``share``."""
-            group = self.groups[index].name
-            value = float(group_returns(rolled, self.groups)[:, index] @ share)
-            rows.append((method, group, "return", value))
-            recovered = recovery(value, random=float(random[index]), oracle=float(oracle[index]))
-            rows.append((method, group, "recovery", recovered))
-            success = float(success_rate(rolled, self.env.success) @ share)
-            rows.append((method, group, "success", success))
-            if self.env.door is not None:
-                for door, rate in info_rates(rolled, self.env.door).items():
-                    if door >= 0:
-                        name = f"{self.env.door}_{door}"
-                        rows.append((method, group, name, float(rate @ share)))
-
-        def add_accuracy(method: str, index: int, catered: float, best: float) -> None:
-            group = self.groups[index].name
-            rows.append((method, group, "accuracy", catered))
-            rows.append((method, group, "best_accuracy", best))
-
-        accuracy = self.accuracy(policies)
+        random = self.acting(None)
+        base = None if baselines is None else self.acting(baselines)
+        oracle = None if base is None else group_returns(base[1:], self.groups).diagonal()
+        rows = _Rows(self.groups, self.env, random=random, oracle=oracle)
         catered: dict[str, int] = {}
-        for label, method in (("popl", "posterior"), ("popl_lexicase", "lexicase")):
-            picks = self.cater(policies, method)
-            used, position = picks.unique(return_inverse=True)
-            rolled = self.roll_out(policies.subset(used.tolist()))
-            for index, group in enumerate(self.groups):
-                share = position[index].bincount(minlength=len(used)).float()
-                add(label, index, rolled, share / share.sum())
-                mean = float(accuracy[picks[index], index].mean())
-                add_accuracy(label, index, mean, float(accuracy[:, index].max()))
-                if label == "popl":
-                    favourite = int(share.argmax())
-                    catered[group.name] = int(used[favourite])
-                    episodes[label, group.name] = rolled[favourite : favourite + 1]
+        episodes: dict[tuple[str, str], TensorDict] = {}
+        sets = {"popl": hypotheses} | ({} if rivals is None else {"brex": rivals.brex})
+        for label, found in sets.items():
+            accuracy = self.accuracy(found)
+            for method in ("posterior", "lexicase"):
+                name = label if method == "posterior" else f"{label}_lexicase"
+                picks = self.cater(found, method)
+                used, position = picks.unique(return_inverse=True)
+                rolled = self.acting(found.subset(used.tolist()))
+                for index, group in enumerate(self.groups):
+                    share = position[index].bincount(minlength=len(used)).float()
+                    mean = float(accuracy[picks[index], index].mean())
+                    rows.add(name, index, rolled, share / share.sum())
+                    rows.add_accuracy(name, index, mean, float(accuracy[:, index].max()))
+                    if name == "popl":
+                        favourite = int(share.argmax())
+                        catered[group.name] = int(used[favourite])
+                        episodes[name, group.name] = rolled[favourite : favourite + 1]
         if baselines is not None and base is not None:
-            base_accuracy, one = self.accuracy(baselines), torch.ones(1)
+            accuracy, one = self.accuracy(baselines), torch.ones(1)
+            pooled = "cpl" if isinstance(baselines, PolicySet) else "bradley_terry"
             for index, group in enumerate(self.groups):
-                for label, row in (("cpl", 0), ("oracle", 1 + index)):
-                    add(label, index, base[row : row + 1], one)
-                    value = float(base_accuracy[row, index])
-                    add_accuracy(label, index, value, value)
+                for label, row in ((pooled, 0), ("oracle", 1 + index)):
+                    rows.add(label, index, base[row : row + 1], one)
+                    value = float(accuracy[row, index])
+                    rows.add_accuracy(label, index, value, value)
                     episodes[label, group.name] = base[row : row + 1]
+        if rivals is not None:
+            self._score_distributional(rivals, rows)
         for index in range(len(self.groups)):
-            add("random", index, rolled_random, torch.ones(1))
-        results = pd.DataFrame(rows, columns=["method", "group", "measure", "value"])
+            rows.add("random", index, random, torch.ones(1))
+        results = pd.DataFrame(rows.rows, columns=["method", "group", "measure", "value"])
         return Scoreboard(results, catered, episodes)
+
+    def _score_distributional(self, rivals: Rivals, rows: "_Rows") -> None:
+        assert isinstance(self.acting, Choosing)
+        for label, score in rivals.scores(self.bank).items():
+            chosen = self.acting.choose(score.cpu().unsqueeze(0))
+            accuracy = group_accuracy(score.cpu().unsqueeze(0), self.pairs)[0].tolist()
+            for index, value in enumerate(accuracy):
+                rows.add(label, index, chosen, torch.ones(1))
+                rows.add_accuracy(label, index, value, value)
+        for kind, model in rivals.dpl.items():
+            context = model.hidden_context(self.bank)
+            rows.rows.append((f"dpl_{kind}", "all", "hidden_context", context))
+
+
+class _Rows:
+    """Tidy rows in the making."""
+
+    def __init__(
+        self,
+        groups: Sequence[RaterGroup],
+        env: EnvConfig,
+        *,
+        random: TensorDict,
+        oracle: Tensor | None,
+    ) -> None:
+        self.groups, self.env = groups, env
+        self.random = group_returns(random, groups)[0]
+        self.oracle = torch.full_like(self.random, float("nan")) if oracle is None else oracle
+        self.rows: list[tuple[str, str, str, float]] = []
+
+    def add(self, method: str, index: int, rolled: TensorDict, share: Tensor) -> None:
+        """What a method does for one group: policies ``[P, E, H]``, weighted by ``share``."""
+        group = self.groups[index].name
+        value = float(group_returns(rolled, self.groups)[:, index] @ share)
+        low, high = float(self.random[index]), float(self.oracle[index])
+        self.rows.append((method, group, "return", value))
+        self.rows.append((method, group, "recovery", recovery(value, random=low, oracle=high)))
+        success = float(success_rate(rolled, self.env.success) @ share)
+        self.rows.append((method, group, "success", success))
+        if self.env.door is not None:
+            for door, rate in info_rates(rolled, self.env.door).items():
+                if door >= 0:
+                    name = f"{self.env.door}_{door}"
+                    self.rows.append((method, group, name, float(rate @ share)))
+
+    def add_accuracy(self, method: str, index: int, catered: float, best: float) -> None:
+        """How well a method ranks for one group."""
+        group = self.groups[index].name
+        self.rows.append((method, group, "accuracy", catered))
+        self.rows.append((method, group, "best_accuracy", best))
+
+
+def make_judge(
+    config: Config,
+    world: World,
+    groups: tuple[RaterGroup, ...],
+    data: Data,
+    spec: PolicySpec | RewardSpec,
+    *,
+    seed: int,
+) -> Judge:
+    """The judge that fits what is learnt and where.
+
+    Policies are rolled out. Reward functions are planned for or optimised by PPO, and rolled out;
+    where there is nothing to do they choose from menus of fresh segments.
+
+    Raises:
+        ValueError: If planning is asked for without a transition table.
+    """
+    device, options = config.device, config.evaluation
+    if has_nothing_to_do(world.env):
+        segments = fresh_segments(config.data, world, seed=seed, max_steps=config.env.max_steps)
+        bank = build_bank(segments, spec).to(device)
+        worth = torch.stack([group.worth(segments) for group in groups])
+        chooser = Choosing(segments, bank, options, seed=seed)
+        return Judge(chooser, config.env, options, groups, bank, worth, seed=seed)
+    bank = build_bank(data.steps, spec).to(device)
+    acting: Acting = Rolling(world, config.env, options, seed=seed)
+    if isinstance(spec, RewardSpec):
+        can_plan = world.table is not None and options.optimiser != "ppo"
+        if can_plan or options.optimiser == "plan":
+            acting = Planning(world, config.env, options, seed=seed)
+        else:
+            acting = Optimising(world, config.env, options, seed=seed, bank=bank)
+    return Judge(acting, config.env, options, groups, bank, data.worth, seed=seed)

@@ -237,6 +237,14 @@ class SegmentBank:
         row = torch.arange(len(flat), device=flat.device).view(observation.shape[:2])
         return cls(flat, row, action, False)
 
+    def subset(self, index: Tensor) -> "SegmentBank":
+        """Some of the segments, in the order of ``index``."""
+        row, action = self.row[index], self.action[index]
+        if self.is_shared:
+            return SegmentBank(self.observation, row, action, True)
+        own = torch.arange(row.numel(), device=row.device).view(row.shape)
+        return SegmentBank(self.observation[row.flatten()], own, action, False)
+
     def to(self, device: torch.device | str) -> "SegmentBank":
         """The same segments on another device."""
         return SegmentBank(

@@ -2,7 +2,6 @@ import math
 from pathlib import Path
 
 import pytest
-from omegaconf import OmegaConf
 
 import popl_rl.configs
 from popl_rl.config import (
@@ -175,21 +174,33 @@ def test_epsilon_refuses(epsilon):
         parse_epsilon(epsilon)
 
 
-@pytest.mark.parametrize(
-    "path", sorted(FOLDER.glob("*/*.yaml")), ids=lambda path: f"{path.parent.name}/{path.stem}"
+CHOICES = sorted(
+    f"{group}={path.relative_to(FOLDER / group).with_suffix('').as_posix()}"
+    for group in ("env", "raters", "method", "logger")
+    for path in (FOLDER / group).rglob("*.yaml")
 )
-def test_every_choice_fits_its_schema_and_is_valid(path):
-    group = path.parent.name
-    config = OmegaConf.structured(valid())
-    config[group] = OmegaConf.merge(
-        OmegaConf.structured(SCHEMAS[group]), OmegaConf.load(path) or {}
-    )
-    if not config.raters.groups:
-        config.raters.groups = ["upper", "lower"]
-    must_be_given = {"gym": ("id", "CartPole-v1"), "custom": ("factory", "my_env.py:make")}
-    if path.stem in must_be_given:
-        name, value = must_be_given[path.stem]
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_every_choice_fits_its_schema_and_is_valid(choice, config_of):
+    config = config_of(choice)
+    must_be_given = {
+        "env=gym": ("id", "CartPole-v1"),
+        "env=custom": ("factory", "my_env.py:make"),
+    }
+    if choice in must_be_given:
+        name, value = must_be_given[choice]
         with pytest.raises(ValueError, match=rf"env\.{name} must be"):
             validate(config)
         config.env[name] = value
     validate(config)
+
+
+def test_an_environment_can_name_raters_of_its_own(config_of):
+    assert config_of("env=hidden_utility").raters.groups == ["zeroed", "doubled"]
+    assert len(config_of("env=hidden_utility", "raters=cycle").raters.groups) == 3
+
+
+def test_a_method_outranks_an_environment(config_of):
+    config = config_of("env=hidden_utility", "method=popl_published")
+    assert (config.method.members, config.method.generations) == (100, 100)

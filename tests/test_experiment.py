@@ -11,18 +11,12 @@ from popl_rl.config import (
     RatersConfig,
     ResponseConfig,
 )
-from popl_rl.experiment import (
-    behaviour_shares,
-    build_groups,
-    build_popl,
-    build_world,
-    make_data,
-    stream,
-)
+from popl_rl.experiment import build_groups, build_popl, make_data, stream
 from popl_rl.keys import ANSWER, GROUP, PAIR, RATER, UTILITY
 from popl_rl.policies import PolicySpec
 from popl_rl.segments import SegmentBank, save_tensordict
 from popl_rl.variation import GaussianHead, GradientCPL
+from popl_rl.worlds import behaviour_shares, build_world
 
 TINY = EnvConfig(factory="popl_rl.testing:tiny_env", options={"max_steps": 8})
 LEFT_RIGHT = ["popl_rl.testing:likes_left", "popl_rl.testing:likes_right"]

@@ -7,7 +7,7 @@ import torch
 
 from popl_rl.comparisons import Comparisons
 from popl_rl.config import MethodConfig
-from popl_rl.experiment import build_popl, final_policies
+from popl_rl.experiment import build_popl, final_set
 from popl_rl.keys import GROUP, HIDDEN_KEYS, LEARNER_KEYS, UTILITY
 from popl_rl.policies import PolicySpec
 from popl_rl.segments import SegmentBank
@@ -60,7 +60,7 @@ def learn(preferences, segments, **method):
         generator=torch.Generator().manual_seed(0),
     )
     metrics = [popl.step() for _ in range(3)]
-    policies = final_policies(popl)
+    policies = final_set(popl)
     members = list(policies.population.state_dict().values())
     return metrics, policies.origin, members, tensors_of(popl.state_dict())
 

@@ -174,7 +174,7 @@ def test_distinct_members_by_hand(monkeypatch, bank, comparisons, generator):
     margin = torch.tensor([[1.0, -1.0], [1.0, 0.0], [-1.0, 1.0], [2.0, -0.5]])
     monkeypatch.setattr("popl_rl.policy_set.margins", lambda *_, **__: margin)
     population = Population.create(PolicySpec(5, 2, True, ()), 4, generator=generator)
-    policies = PolicySet.distinct(population, bank, comparisons, alpha=0.3, discount=0.9)
+    policies = PolicySet(population, alpha=0.3, discount=0.9).distinct(bank, comparisons)
     assert policies.origin == [0, 2]
     assert len(policies) == 2
     assert (policies.alpha, policies.discount) == (0.3, 0.9)

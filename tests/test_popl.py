@@ -8,13 +8,14 @@ from hypothesis import strategies as st
 from popl_rl.comparisons import Comparisons
 from popl_rl.config import DataConfig, EnvConfig, MethodConfig, RatersConfig
 from popl_rl.evaluation import group_accuracy, held_out_pairs
-from popl_rl.experiment import build_groups, build_popl, build_world, make_data, stream
+from popl_rl.experiment import build_groups, build_popl, make_data, stream
 from popl_rl.losses import CPLLoss
 from popl_rl.policies import PolicySpec
 from popl_rl.popl import POPL, case_values, mad, margins, rater_accuracy
 from popl_rl.population import Population, segment_scores
 from popl_rl.segments import SegmentBank
 from popl_rl.variation import GaussianHead, GradientCPL
+from popl_rl.worlds import build_world
 
 
 def make(bank, comparisons, *, variation="gradient", seed=0, members=6, epsilon="mad"):

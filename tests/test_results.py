@@ -4,12 +4,14 @@ import pytest
 import torch
 from torch import nn
 
+from popl_rl.acting import Rolling
 from popl_rl.config import EnvConfig, EvaluationConfig, RatersConfig
-from popl_rl.experiment import build_groups, build_world
+from popl_rl.experiment import build_groups
 from popl_rl.policies import PolicySpec
 from popl_rl.policy_set import PolicySet
 from popl_rl.population import Population
 from popl_rl.results import Judge
+from popl_rl.worlds import build_world
 
 ENV = EnvConfig(
     factory="popl_rl.testing:tiny_env",
@@ -40,7 +42,8 @@ def judge(segments, bank):
     groups = build_groups(RatersConfig(groups=names, label="regret"), world)
     worth = torch.stack([group.worth(segments) for group in groups])
     config = EvaluationConfig(episodes=6, new_raters=4, answers=10, pairs=200)
-    return Judge(world, ENV, config, groups, bank, worth, seed=0)
+    acting = Rolling(world, ENV, config, seed=0)
+    return Judge(acting, ENV, config, groups, bank, worth, seed=0)
 
 
 @pytest.fixture

@@ -14,13 +14,13 @@ from omegaconf import OmegaConf
 from rich.console import Console
 
 from popl_rl.config import Config, EvaluateConfig, validate
-from popl_rl.experiment import build_groups, build_world, make_data
-from popl_rl.policy_set import PolicySet
+from popl_rl.experiment import build_groups, build_spec, make_data
+from popl_rl.policy_set import PolicySet, RewardSet, load_set
 from popl_rl.report import markdown, results_table
-from popl_rl.results import Judge, Scoreboard
+from popl_rl.results import Scoreboard, make_judge
 from popl_rl.runs import load_config, save_config, write_atomic
-from popl_rl.segments import SegmentBank
 from popl_rl.trainers.command import register_schemas, run_command
+from popl_rl.worlds import build_world
 
 
 def run(config: EvaluateConfig) -> tuple[Path, Scoreboard]:
@@ -29,9 +29,10 @@ def run(config: EvaluateConfig) -> tuple[Path, Scoreboard]:
     stored: Any = OmegaConf.merge(OmegaConf.structured(Config), load_config(run_dir))
     stored.evaluation = config.evaluation
     validate(stored)
-    policies = PolicySet.load(run_dir / "policies")
+    is_reward = (run_dir / RewardSet.folder).is_dir()
+    found = load_set(run_dir / (RewardSet if is_reward else PolicySet).folder)
     base_path = run_dir / "baselines"
-    baselines = PolicySet.load(base_path) if base_path.is_dir() else None
+    baselines = load_set(base_path) if base_path.is_dir() else None
     world = build_world(stored.env)
     groups = build_groups(stored.raters, world)
     kept = run_dir / "data"
@@ -44,9 +45,9 @@ def run(config: EvaluateConfig) -> tuple[Path, Scoreboard]:
         max_steps=stored.env.max_steps,
         load=kept if kept.is_dir() else None,
     )
-    bank = SegmentBank.from_segments(data.steps)
-    judge = Judge(world, stored.env, config.evaluation, groups, bank, data.worth, seed=config.seed)
-    board = judge.score(policies, baselines)
+    spec = build_spec(stored.method, world.env)
+    judge = make_judge(stored, world, groups, data, spec, seed=config.seed)
+    board = judge.score(found, baselines)
     number = 1 + len(list((run_dir / "evaluations").glob("[0-9]*")))
     folder = run_dir / "evaluations" / f"{number:03d}"
     beside = folder.with_name(f".{folder.name}")

@@ -14,32 +14,34 @@ import shutil
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import hydra
 import torch
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from popl_rl.baselines import group_weights, train_cpl
 from popl_rl.comparisons import Comparisons
 from popl_rl.config import Config, validate
 from popl_rl.experiment import (
+    build_bank,
     build_groups,
     build_popl,
-    build_world,
-    final_policies,
+    build_spec,
+    final_set,
     generations_of,
     make_data,
     stream,
+    train_baselines,
 )
-from popl_rl.keys import ANSWER, GROUP, Answer
+from popl_rl.findings import findings
 from popl_rl.loggers import make_logger
 from popl_rl.pictures import draw
-from popl_rl.policies import PolicySpec
-from popl_rl.policy_set import PolicySet
+from popl_rl.policy_set import HypothesisSet, as_set
 from popl_rl.report import markdown, results_table
-from popl_rl.results import Judge, Scoreboard
+from popl_rl.results import Scoreboard, make_judge
+from popl_rl.reward_baselines import train_rivals
+from popl_rl.rewards import RewardSpec
 from popl_rl.runs import (
     MetricsWriter,
     Progress,
@@ -49,9 +51,9 @@ from popl_rl.runs import (
     write_atomic,
     write_metadata,
 )
-from popl_rl.segments import SegmentBank
 from popl_rl.trainer import POPLTrainer
 from popl_rl.trainers.command import register_schemas, run_command
+from popl_rl.worlds import build_world, has_nothing_to_do
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class Result:
     """What a run leaves behind."""
 
     run_dir: Path
-    policies: PolicySet
+    policies: HypothesisSet
     board: Scoreboard
 
 
@@ -101,15 +103,15 @@ def run(config: Config) -> Result:
         )
     if config.data.save:
         data.save(kept)
-    bank = SegmentBank.from_segments(data.steps).to(config.device)
+    spec = build_spec(config.method, world.env)
+    bank = build_bank(data.steps, spec).to(config.device)
     comparisons = Comparisons.from_preferences(data.preferences, cases=config.method.cases)
     comparisons = comparisons.to(config.device)
 
     # 3. The population, evolved.
     learner = stream(config.seed, "learner", config.device)
-    spec = PolicySpec.from_env(world.env, hidden=config.method.hidden)
     popl = build_popl(config.method, spec, bank, comparisons, generator=learner)
-    judge = Judge(world, config.env, config.evaluation, groups, bank, data.worth, seed=config.seed)
+    judge = make_judge(config, world, groups, data, spec, seed=config.seed)
     metrics = MetricsWriter(run_dir / "metrics.csv")
     history = MetricsWriter(run_dir / "history.csv")
     generations = generations_of(config.method)
@@ -126,7 +128,7 @@ def run(config: Config) -> Result:
             progress.update(generation, worst_rater_accuracy=worst)
             every = config.evaluation.history
             if every and (generation % every == 0 or generation in (1, generations)):
-                now = PolicySet(popl.population, alpha=popl.alpha, discount=popl.discount)
+                now = as_set(popl.population, alpha=popl.alpha, discount=popl.discount)
                 history.write(generation, judge.snapshot(now))
 
         trainer = POPLTrainer(
@@ -140,47 +142,50 @@ def run(config: Config) -> Result:
         metrics.truncate_to(done)
         history.truncate_to(done)
         trainer.train()
-        policies = final_policies(popl)
-        _save_anew(policies, run_dir / "policies")
+        found = final_set(popl)
+        _save_anew(found, run_dir / found.folder)
 
         # 4. What the set is compared with, on the same data.
         baselines = None
         if config.evaluation.baselines:
-            if GROUP not in data.preferences.keys(True):
-                raise ValueError(
-                    "the loaded preferences name no hidden groups, which the oracle needs; set "
-                    "evaluation.baselines=false"
-                )
-            strict = data.preferences[ANSWER] <= Answer.SECOND
-            weight = group_weights(data.preferences[GROUP][strict], len(groups))
             with Progress("baselines", total=config.evaluation.baseline_steps) as baseline_bar:
-                baselines = train_cpl(
+                baselines = train_baselines(
+                    config.evaluation,
                     spec,
                     bank,
                     comparisons,
-                    weight.to(config.device),
-                    steps=config.evaluation.baseline_steps,
-                    batch_size=config.evaluation.baseline_batch_size,
-                    learning_rate=config.evaluation.baseline_learning_rate,
-                    alpha=config.evaluation.baseline_alpha,
-                    conservatism=config.evaluation.baseline_conservatism,
+                    data.preferences,
+                    num_groups=len(groups),
                     generator=stream(config.seed, "baselines", config.device),
                     progress=baseline_bar.update,
                 )
             _save_anew(baselines, run_dir / "baselines")
+        rivals = None
+        if config.evaluation.reward_baselines and has_nothing_to_do(world.env):
+            rivals = train_rivals(
+                cast("RewardSpec", spec),
+                bank,
+                comparisons,
+                brex_steps=config.evaluation.brex_steps,
+                dpl_steps=config.evaluation.dpl_steps,
+                generator=stream(config.seed, "rivals", config.device),
+            )
 
         # 5. Judged by every hidden group; told in a table, in pictures and in words.
-        board = judge.score(policies, baselines)
+        board = judge.score(found, baselines, rivals=rivals)
         write_atomic(run_dir / "results.csv", board.results.to_csv(index=False))
-        figures = draw(run_dir, policies, baselines, board=board, judge=judge, world=world)
+        figures = draw(
+            run_dir, found, baselines, board=board, judge=judge, world=world, rivals=rivals
+        )
         logger.log_figures(figures, generations)
         logger.log_table("results", board.results)
     about = {
-        "policies in the set": f"{len(policies)}, effectively "
-        f"{policies.effective_number(bank, comparisons):.1f}",
+        f"{found.folder} in the set": f"{len(found)}, effectively "
+        f"{found.effective_number(bank, comparisons):.1f}",
         "comparisons": f"{len(comparisons)} strict, {comparisons.num_dropped} ties and skips",
         "cases": f"{comparisons.num_cases} ({config.method.cases}s)",
         "seed": config.seed,
+        **findings(board, judge),
     }
     text = markdown(
         board.results,
@@ -189,13 +194,13 @@ def run(config: Config) -> Result:
         figures=[Path("figures") / path.name for path in figures.values()],
     )
     write_atomic(run_dir / "report.md", text)
-    return Result(run_dir, policies, board)
+    return Result(run_dir, found, board)
 
 
-def _save_anew(policies: PolicySet, path: Path) -> None:
+def _save_anew(found: HypothesisSet, path: Path) -> None:
     """Save a set in the place of what a killed run may have left."""
     shutil.rmtree(path, ignore_errors=True)
-    policies.save(path)
+    found.save(path)
 
 
 def show(result: Result) -> None:

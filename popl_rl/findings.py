@@ -1,0 +1,63 @@
+"""What a reader of a report should not have to find out alone."""
+
+import torch
+
+from popl_rl.acting import Choosing
+from popl_rl.keys import OBSERVATION
+from popl_rl.majority import find_cycle, majority
+from popl_rl.results import Judge, Scoreboard
+
+__all__ = ["findings"]
+
+_ITEMS = 150  # of which three are looked for that a majority prefers in a circle
+
+
+def findings(board: Scoreboard, judge: Judge) -> dict[str, str]:
+    """Put into words what stands out.
+
+    Args:
+        board: What came out.
+        judge: With the groups and what things are worth to them.
+
+    Returns:
+        Sentences by what they are about: ``collapse``, if groups were given the same hypothesis;
+        ``hidden context``, DPL's detector, if it ran; ``majority``, if the groups, pooled in equal
+        shares, prefer states in a circle, so that no single utility can say what they want.
+    """
+    said = {}
+    shared: dict[int, list[str]] = {}
+    for name, member in board.catered.items():
+        shared.setdefault(member, []).append(name)
+    together = [" and ".join(names) for names in shared.values() if len(names) > 1]
+    if together:
+        said["collapse"] = (
+            f"{', '.join(together)} were given the same hypothesis: the set does not tell them "
+            "apart"
+        )
+    table = board.results
+    context = table[table.measure == "hidden_context"]
+    if len(context):
+        each = ", ".join(f"{row.method} {row.value:.2f}" for row in context.itertuples())
+        said["hidden context (DPL's r², 1 for none)"] = each
+    circle = _circle(judge)
+    if circle is not None:
+        said["majority"] = circle
+    return said
+
+
+def _circle(judge: Judge) -> str | None:
+    if not isinstance(judge.acting, Choosing):
+        return None
+    worth = judge.worth[:, :_ITEMS]
+    preferred = majority(worth)
+    cycle = find_cycle(preferred)
+    if cycle is None:
+        return None
+    states = judge.acting.segments[OBSERVATION][cycle, 0]
+    names = ["(" + ", ".join(f"{x:.2f}" for x in state.tolist()) + ")" for state in states]
+    ahead = preferred[torch.tensor(cycle), torch.tensor(cycle).roll(-1)].tolist()
+    steps = [
+        f"{one} to {other} ({share:.0%})"
+        for one, other, share in zip(names, names[1:] + names[:1], ahead, strict=True)
+    ]
+    return f"prefers in a circle: {', '.join(steps)}"
