@@ -4,6 +4,7 @@
 comes next in each selection and when a selection is over. Nothing here checks its arguments.
 """
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -41,24 +42,63 @@ class Epsilon:
 
 def median_absolute_deviation(values: Tensor) -> Tensor:
     """Median distance from the median of each column: ``[member, case] -> [case]``."""
-    values = values.T.contiguous()
+    values = values.detach().T.contiguous()
     return _median((values - _median(values)[:, None]).abs_())
 
 
 def _median(values: Tensor) -> Tensor:
     """Median of each row, the mean of the two middle values if there are two."""
-    half = values.shape[1] // 2 + 1
-    # Seen as ints, floats keep their order once the bits under a minus sign are flipped, and topk
-    # is a third faster on ints.
-    ints = torch.int32 if values.dtype == torch.float32 else torch.int64
-    keys = _flip(values.contiguous().view(ints)).topk(half, largest=False, sorted=False).values
-    lower = _flip(keys).view(values.dtype)
-    return lower.amax(1) if values.shape[1] % 2 else lower.topk(2).values.mean(1)
+    count, middle = values.shape[1], values.shape[1] // 2
+    if values.device.type == "cpu":  # NumPy partitions several times faster than torch
+        ordered = torch.from_numpy(np.partition(values.numpy(), middle, axis=1))
+        lower = ordered[:, : max(1, middle)].amax(1)
+    else:
+        ordered = values.sort(dim=1).values
+        lower = ordered[:, max(0, middle - 1)]
+    upper = ordered[:, middle]
+    return upper if count % 2 else (lower + upper) / 2
 
 
-def _flip(keys: Tensor) -> Tensor:
-    largest = torch.iinfo(keys.dtype).max
-    return keys ^ ((keys >> largest.bit_length()) & largest)
+def select_dynamically(
+    scores: Tensor, labels: Tensor, num_selected: int, *, limit: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Select members with a tolerance that is worked out anew in each pool, one after the other.
+
+    Neither merging nor drawing cases twice is exact here: how many share a score, and how often a
+    case is met, both matter.
+
+    Args:
+        scores: ``[member, case]``, floating.
+        labels: Number of each member's behaviour, ``[member]``.
+        num_selected: Parents to select.
+        limit: Cases that each selection may look at.
+        generator: Source of the case orders and of the tie breaks.
+
+    Returns:
+        The member chosen by each selection and its depth, ``[num_selected]`` each.
+    """
+    device = scores.device
+    parents = torch.empty(num_selected, dtype=torch.long, device=device)
+    depths = torch.zeros_like(parents)
+    everyone = torch.arange(len(scores), device=device)
+    several = bool((labels != labels[0]).any())
+    for selection in range(num_selected):
+        pool = everyone
+        if several:
+            order = torch.randperm(scores.shape[1], generator=generator, device=device)[:limit]
+            for depth, case in enumerate(order.tolist(), start=1):
+                values = scores[pool, case]
+                tolerance = median_absolute_deviation(values[:, None])
+                stay = values >= values.amax() - tolerance
+                if bool(stay.all()):
+                    continue
+                pool = pool[stay]
+                depths[selection] = depth
+                if bool((labels[pool] == labels[pool[0]]).all()):
+                    break
+        draw = torch.randint(len(pool), (), generator=generator, device=device)
+        parents[selection] = pool[draw]
+    return parents, depths
 
 
 class PassPools:
@@ -140,16 +180,14 @@ class PassPools:
 def _pack(flags: Tensor) -> Tensor:
     """Put eight rows of 0 and 1 into one row of bytes: ``[member, case] -> [member / 8, case]``."""
     packed = flags.new_empty(-(-len(flags) // 8), flags.shape[1])
+    places = 2 ** torch.arange(8, dtype=torch.uint8, device=flags.device).unsqueeze(1)
     rows = max(1, 2**17 // flags.shape[1])  # so that a part stays in the processor's cache
     parts = zip(torch.split(packed, rows), torch.split(flags, 8 * rows), strict=True)
     for packed_part, part in parts:
         if len(part) % 8:
             # The last member fills the byte up: unlike zeros it splits no case by itself.
             part = torch.cat([part, part[-1:].expand(-len(part) % 8, -1)])
-        lanes = part.view(-1, 8, part.shape[1]).unbind(1)
-        packed_part.copy_(lanes[0])
-        for lane in range(1, 8):
-            packed_part.add_(lanes[lane], alpha=2**lane)
+        packed_part.copy_((part.view(-1, 8, part.shape[1]) * places).sum(1, dtype=torch.uint8))
     return packed
 
 

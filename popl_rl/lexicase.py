@@ -25,7 +25,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from popl_rl._pools import Epsilon, PassPools, Round, ScorePools
+from popl_rl._pools import Epsilon, PassPools, Round, ScorePools, select_dynamically
 
 __all__ = ["SelectionReport", "lexicase_report", "lexicase_selection"]
 
@@ -62,7 +62,7 @@ def lexicase_selection(
     num_selected: int,
     *,
     epsilon: float | Tensor | Literal["mad"] | None = None,
-    epsilon_mode: Literal["static", "semi-dynamic"] = "semi-dynamic",
+    epsilon_mode: Literal["static", "semi-dynamic", "dynamic"] = "semi-dynamic",
     cases_per_selection: int | None = None,
     generator: torch.Generator,
 ) -> Tensor:
@@ -77,13 +77,15 @@ def lexicase_selection(
             of its scores over the whole population (members, not behaviours; with an even number
             of values the median is the mean of the two middle ones). The default, None, is plain
             lexicase selection, as is 0.
-        epsilon_mode: What "the best" means if there is an epsilon, in the terms of La Cava et al.
-            (2019). In both modes epsilon itself is computed over the whole population; their
-            fully dynamic variant, which recomputes it in each pool, is not offered.
-            ``"semi-dynamic"``: the best of the pool; a case keeps the members whose score is at
-            least the best score left in the pool minus epsilon.
-            ``"static"``: the best of the population; scores become passes (score at least the best
-            in the population minus epsilon), and plain lexicase selection runs on those.
+        epsilon_mode: Whom members are compared with if there is an epsilon, in the terms of La
+            Cava et al. (2019).
+            ``"static"``: the population; scores become passes (score at least the best in the
+            population minus epsilon), and plain lexicase selection runs on those.
+            ``"semi-dynamic"``: the pool; a case keeps the members whose score is at least the
+            best score left in the pool minus epsilon, which is the population's.
+            ``"dynamic"``: the pool, and ``"mad"`` too is the pool's. Selections then run one
+            after the other, which is tens of times slower. With any other epsilon the same as
+            ``"semi-dynamic"``.
         cases_per_selection: If given, each selection sees only a random subset of this many cases,
             drawn anew for each (down-sampling per selection). None: all of them.
         generator: Source of all randomness, on the device of ``scores``.
@@ -119,7 +121,7 @@ def lexicase_report(
     num_selected: int,
     *,
     epsilon: float | Tensor | Literal["mad"] | None = None,
-    epsilon_mode: Literal["static", "semi-dynamic"] = "semi-dynamic",
+    epsilon_mode: Literal["static", "semi-dynamic", "dynamic"] = "semi-dynamic",
     cases_per_selection: int | None = None,
     generator: torch.Generator,
 ) -> SelectionReport:
@@ -136,32 +138,38 @@ def lexicase_report(
     _check_count("num_selected", num_selected, None)
     if cases_per_selection is not None:
         _check_count("cases_per_selection", cases_per_selection, num_cases)
-    if epsilon_mode not in ("static", "semi-dynamic"):
+    if epsilon_mode not in ("static", "semi-dynamic", "dynamic"):
         raise ValueError(
-            f"epsilon_mode must be 'static' or 'semi-dynamic', got {epsilon_mode!r}; use "
-            "'semi-dynamic' to compare with the best of the remaining pool"
+            f"epsilon_mode must be 'static', 'semi-dynamic' or 'dynamic', got {epsilon_mode!r}; "
+            "use 'semi-dynamic' to compare with the best of the remaining pool"
         )
     _check_generator(generator, scores.device)
 
     scores, tolerance = _prepare(scores.detach(), epsilon, epsilon_mode)
     labels, first = _label_behaviours(scores)
     behaviours = scores if len(first) == len(scores) else scores[first]
-    twins = labels.bincount()
-    if scores.dtype == torch.bool:
-        pools: PassPools | ScorePools = PassPools(behaviours)
-    else:
-        pools = ScorePools(behaviours, None if tolerance is None else Epsilon(tolerance, scores))
     limit = num_cases if cases_per_selection is None else cases_per_selection
-    chosen, depth = Round(pools, twins, limit=limit, generator=generator).select(num_selected)
-
-    parents = chosen
-    if len(first) < len(scores):
-        # Members sorted by behaviour, and a place among those of the chosen one.
-        draw = torch.rand(
-            num_selected, generator=generator, device=scores.device, dtype=torch.float64
+    if epsilon_mode == "dynamic" and epsilon == "mad" and tolerance is not None:
+        parents, depth = select_dynamically(
+            scores, labels, num_selected, limit=limit, generator=generator
         )
-        place = (twins.cumsum(0) - twins)[chosen] + (draw * twins[chosen]).long()
-        parents = labels.argsort(stable=True)[place]
+        chosen = labels[parents]
+    else:
+        twins = labels.bincount()
+        if scores.dtype == torch.bool:
+            pools: PassPools | ScorePools = PassPools(behaviours)
+        else:
+            bars = None if tolerance is None else Epsilon(tolerance, scores)
+            pools = ScorePools(behaviours, bars)
+        chosen, depth = Round(pools, twins, limit=limit, generator=generator).select(num_selected)
+        parents = chosen
+        if len(first) < len(scores):
+            # Members sorted by behaviour, and a place among those of the chosen one.
+            draw = torch.rand(
+                num_selected, generator=generator, device=scores.device, dtype=torch.float64
+            )
+            place = (twins.cumsum(0) - twins)[chosen] + (draw * twins[chosen]).long()
+            parents = labels.argsort(stable=True)[place]
     shares = chosen.bincount() / num_selected
     return SelectionReport(
         parents=parents,
@@ -188,7 +196,7 @@ def _prepare(
         # A fail trails a pass by 1, and the median absolute deviation of passes is at most 1/2.
         return scores | (tolerance >= 1), None
     scores = scores.to(tolerance.dtype)
-    if mode == "semi-dynamic":
+    if mode != "static":
         return scores, tolerance
     everywhere = torch.arange(scores.shape[1], device=scores.device)
     return scores >= scores.amax(0) - Epsilon(tolerance, scores).at(everywhere), None

@@ -1,23 +1,33 @@
 """N policies, or reward functions, as one stack of parameters: score, clone, swap members."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Literal
 
 import torch
+import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from torch import Tensor, nn
 
 from popl_rl.policies import Spec, build_network
+from popl_rl.rewards import RewardSpec
 from popl_rl.segments import SegmentBank
 
 __all__ = ["Population", "segment_scores"]
+
+# A CPU core multiplies fastest what stays in its cache from one layer to the next.
+_ROWS = 1024  # observations looked at together
+_BLOCK = 2**18  # outputs of a layer, over these observations and some members
+
+#: Weight and bias of a linear layer of every member, or what comes between two of them.
+_Layer = tuple[Tensor, Tensor | None] | nn.Module
 
 
 class Population(nn.Module):
     """Stacked policies, or reward functions, of one architecture.
 
-    The layers of the members are multiplied together (``baddbmm``), which on a CPU is as fast as
-    a loop over the members and faster than ``torch.vmap``; on a GPU it is one kernel per layer.
+    The layers of the members are multiplied together (``baddbmm``; heads as one matrix), which on
+    a CPU is as fast as a loop over the members and faster than ``torch.vmap``; on a GPU it is one
+    kernel per layer.
 
     Args:
         networks: One ``nn.Sequential`` of linear layers and element-wise activations per member.
@@ -58,9 +68,8 @@ class Population(nn.Module):
         # Sequential(*...) rather than a slice: it numbers the layers from 0.
         own = [nn.Sequential(*list(network)[split:]) for network in networks]
         self.members: TensorDictParams = TensorDict.from_modules(*own, as_module=True)
-        self._activations = [
-            None if isinstance(layer, nn.Linear) else layer for layer in list(networks[0])[split:]
-        ]
+        self._activations = [_activation(layer) for layer in list(networks[0])[split:]]
+        self._seen = _Seen()
 
     @classmethod
     def create(
@@ -99,18 +108,17 @@ class Population(nn.Module):
 
     def from_features(self, features: Tensor) -> Tensor:
         """The members' own layers, applied to outputs of the trunk ``[R, F]`` or ``[N, R, F]``."""
-        hidden = features if features.ndim == 3 else features.expand(len(self), *features.shape)
+        return _apply(self._layers(), features)
+
+    def _layers(self) -> list[_Layer]:
+        layers: list[_Layer] = []
         for position, activation in enumerate(self._activations):
             if activation is not None:
-                hidden = activation(hidden)
+                layers.append(activation)
                 continue
             layer = self.members[str(position)]
-            bias, weight = layer.get("bias", None), layer["weight"].mT
-            if bias is None:
-                hidden = torch.bmm(hidden, weight)
-            else:
-                hidden = torch.baddbmm(bias.unsqueeze(1), hidden, weight)
-        return hidden
+            layers.append((layer["weight"], layer.get("bias", None)))
+        return layers
 
     @torch.no_grad()
     def replace_(self, parents: Tensor) -> None:
@@ -127,7 +135,7 @@ class Population(nn.Module):
         nn.Module.__init__(clone)
         clone.spec, clone.evolve, clone.trunk = self.spec, self.evolve, self.trunk
         clone.members = TensorDictParams(members)
-        clone._activations = self._activations
+        clone._activations, clone._seen = self._activations, self._seen
         return clone
 
     def network(self, index: int) -> nn.Sequential:
@@ -141,9 +149,100 @@ class Population(nn.Module):
         return network
 
 
+def _activation(layer: nn.Module) -> nn.Module | None:
+    if isinstance(layer, nn.Linear):
+        return None
+    # It follows a linear layer, whose output nobody else needs.
+    return nn.ReLU(inplace=True) if isinstance(layer, nn.ReLU) else layer
+
+
+def _apply(layers: Sequence[_Layer], features: Tensor) -> Tensor:
+    """Own layers of N members on features ``[R, F]`` or ``[N, R, F]``, ``[N, R, K]``."""
+    hidden = features
+    for layer in layers:
+        if isinstance(layer, nn.Module):
+            hidden = layer(hidden)
+            continue
+        weight, bias = layer
+        count = len(weight)
+        if hidden.ndim == 2 and len(layers) == 1:
+            # Heads on features they share: one product with all of them below each other.
+            stack = weight.flatten(0, 1)
+            if bias is None:
+                product = stack @ hidden.T
+            else:
+                product = torch.addmm(bias.flatten().unsqueeze(1), stack, hidden.T)
+            return product.view(count, -1, len(hidden)).mT
+        if hidden.ndim == 2:
+            hidden = hidden.expand(count, *hidden.shape)
+        if bias is None:
+            hidden = torch.bmm(hidden, weight.mT)
+        else:
+            hidden = torch.baddbmm(bias.unsqueeze(1), hidden, weight.mT)
+    return hidden
+
+
+class _Seen:
+    """What a frozen trunk makes of one bank, kept from one scoring to the next.
+
+    Shared by a population and its copies. Tensors of a bank are told by identity and version,
+    and the trunk by its parameters: a changed one is looked through again.
+    """
+
+    def __init__(self) -> None:
+        self._bank: tuple[Tensor, ...] = ()
+        self._about: tuple[object, ...] = ()
+        self._trunk: list[Tensor] = []
+        self._value: Tensor | None = None
+
+    def get(
+        self,
+        trunk: nn.Module,
+        bank: SegmentBank,
+        purpose: tuple[object, ...],
+        make: Callable[[], Tensor],
+    ) -> Tensor:
+        """The tensor made for this trunk, bank and purpose, made now if it is not there."""
+        tensors = (bank.observation, bank.row, bank.action)
+        # Tensors made in inference mode keep no version; nor can autograd need them.
+        versions = (None if tensor.is_inference() else tensor._version for tensor in tensors)
+        about = (*purpose, *versions)
+        if (
+            self._value is None
+            or about != self._about
+            or any(one is not two for one, two in zip(tensors, self._bank, strict=True))
+            or not all(map(_same, trunk.parameters(), self._trunk))
+        ):
+            self._value = None  # free it first
+            self._value = make()
+            self._bank, self._about = tensors, about
+            self._trunk = [parameter.detach().clone() for parameter in trunk.parameters()]
+        return self._value
+
+
+def _same(one: Tensor, two: Tensor) -> bool:
+    return one.device == two.device and one.dtype == two.dtype and torch.equal(one, two)
+
+
 def _chunks(total: int, size: int) -> Iterator[slice]:
     for start in range(0, total, size):
         yield slice(start, min(start + size, total))
+
+
+def _each(layers: Sequence[_Layer], change: Callable[[Tensor], Tensor]) -> list[_Layer]:
+    """The same layers with other weights and biases."""
+    changed: list[_Layer] = []
+    for layer in layers:
+        if isinstance(layer, nn.Module):
+            changed.append(layer)
+        else:
+            weight, bias = layer
+            changed.append((change(weight), None if bias is None else change(bias)))
+    return changed
+
+
+def _some(layers: Sequence[_Layer], part: slice) -> list[_Layer]:
+    return _each(layers, lambda tensor: tensor[part])
 
 
 @torch.no_grad()
@@ -154,42 +253,159 @@ def segment_scores(
     alpha: float = 1.0,
     discount: float = 1.0,
     memory_mb: float = 256.0,
+    dtype: torch.dtype = torch.float32,
 ) -> Tensor:
     """Score every segment once per member: ``S_n(sigma) = sum_t gamma^t alpha log pi_n(a_t|s_t)``.
 
     The score inside the CPL loss (arXiv 2310.13639, equation 5); for reward functions the sum of
-    rewards, ``sum_t gamma^t alpha r_n(s_t, a_t)``. Observations that occur more than once in the
-    bank are looked at once.
+    rewards, ``sum_t gamma^t alpha r_n(s_t, a_t)``.
+
+    Observations that occur more than once in the bank are looked at once where actions are
+    discrete, and by reward functions. What a frozen trunk makes of the bank is kept for the next
+    call as long as it takes at most half of ``memory_mb``, else worked out again in chunks. Heads
+    of reward functions are linear: they score a segment by the sum of its features.
 
     Args:
         population: N members.
         bank: The segments.
         alpha: Temperature of CPL's maximum-entropy policies.
         discount: Per-step discount gamma.
-        memory_mb: Bound on the temporaries, in MiB; work is cut into chunks that fit.
+        memory_mb: Bound on the temporaries and on what is kept, in MiB, beside the result itself;
+            work is cut into chunks that fit, down to one segment and one member.
+        dtype: Precision in which the members' own layers are multiplied. ``torch.bfloat16`` pays
+            on processors that multiply it in hardware (AMX, AVX-512 BF16, CUDA) and is many times
+            slower on others; margins are off by some thousandths of their spread, so that
+            nearly tied pairs may change sides. Sums over steps are float32 always.
 
     Returns:
         ``[N, num_segments]`` float32.
     """
-    count, steps = len(population), bank.row.shape[1]
-    weight = alpha * discount ** torch.arange(steps, device=population.device).float()
-    spec = population.spec
-    width = max(spec.observation_dim, *spec.hidden, spec.action_dim, 1)
-    budget = int(memory_mb * 2**20)
-    scores = torch.empty(count, len(bank), device=population.device)
-    if spec.discrete and bank.is_shared:
-        # A table [N, U, K] of step scores answers for every step of every segment.
-        member_bytes = 4 * (3 * width * len(bank.observation) + 4 * bank.row.numel())
-        features = population.trunk(bank.observation)
-        cell = (bank.row * spec.action_dim + bank.action).flatten()
-        for part in _chunks(count, max(1, budget // member_bytes)):
-            some = population.with_members(population.members.data[part])
-            table = spec.table(some.from_features(features)).flatten(1)
-            scores[part] = table[:, cell].view(-1, *bank.row.shape) @ weight
-        return scores
-    for part in _chunks(len(bank), max(1, budget // (4 * 3 * width * steps * count))):
-        observation = bank.observation[bank.row[part]].flatten(0, 1)
-        action = bank.action[part].flatten(0, 1)
-        value = spec.step_scores(population(observation), action)
-        scores[:, part] = value.view(count, -1, steps) @ weight
-    return scores
+    scoring = _Scoring(population, bank, discount, int(memory_mb * 2**18), dtype)
+    scores = torch.empty(len(population), len(bank), device=population.device)
+    if scoring.can_look_up():
+        scoring.look_up(scores)
+    elif len(scoring.layers) == 1 and isinstance(population.spec, RewardSpec):
+        scoring.add_up(scores)
+    else:
+        scoring.walk(scores)
+    return scores.mul_(alpha)
+
+
+class _Scoring:
+    """The three ways to score; ``numbers`` of four bytes may be used, half of them kept."""
+
+    def __init__(
+        self,
+        population: Population,
+        bank: SegmentBank,
+        discount: float,
+        numbers: int,
+        dtype: torch.dtype,
+    ) -> None:
+        self.population, self.bank, self.dtype = population, bank, dtype
+        self.spec, self.trunk = population.spec, population.trunk
+        self.layers = _each(population._layers(), lambda tensor: tensor.to(dtype))
+        self.numbers = numbers
+        self.steps = bank.row.shape[1]
+        self.discount = discount
+        self.weight = discount ** torch.arange(self.steps, device=population.device).float()
+        # Two or three results of a layer are alive at once, and as many of the trunk's.
+        block = numbers // 32
+        if population.device.type == "cpu":
+            block = min(block, _BLOCK)
+        spec = self.spec
+        width = max(spec.observation_dim, *spec.hidden, spec.action_dim)
+        self.rows = max(1, min(_ROWS, block // width))
+        own = spec.action_dim if len(self.layers) == 1 else width
+        self.members = max(1, block // (self.rows * own))
+
+    def can_look_up(self) -> bool:
+        """Whether scores of a member's every choice at every distinct observation fit."""
+        cells = len(self.bank.observation) * self.spec.action_dim
+        return self.spec.discrete and self.bank.is_shared and 8 * cells <= self.numbers
+
+    def look_up(self, scores: Tensor) -> None:
+        """Few distinct observations: a table of step scores answers for every step."""
+        bank, spec, steps = self.bank, self.spec, self.steps
+        distinct, choices = len(bank.observation), spec.action_dim
+        features = self._features()
+        for some in _chunks(len(scores), max(1, self.numbers // (8 * distinct * choices))):
+            layers = _some(self.layers, some)
+            count = len(scores[some])
+            table = torch.empty(count, distinct, choices, device=scores.device)
+            for rows in _chunks(distinct, self.rows):
+                seen = self._see(rows, features)
+                for members in _chunks(count, self.members):
+                    output = _apply(_some(layers, members), seen)
+                    table[members, rows] = spec.table(output.float())
+            # Rows of all members' scores, added up over the steps of each segment.
+            cells = table.flatten(1).T.contiguous()
+            for part in _chunks(len(bank), max(1, self.numbers // (8 * (4 * steps + count)))):
+                cell = bank.row[part] * choices + bank.action[part]
+                weight = self.weight.expand(cell.shape).contiguous()
+                scores[some, part] = F.embedding_bag(
+                    cell, cells, mode="sum", per_sample_weights=weight
+                ).T
+
+    def add_up(self, scores: Tensor) -> None:
+        """Heads linear in the features: add these up over the steps, then multiply once."""
+        layer = self.layers[0]
+        assert isinstance(layer, tuple)
+        heads = layer[0].flatten(1)
+        width = heads.shape[1]
+        sums = None
+        if len(self.bank) * width <= self.numbers // 2:
+            sums = self._keep(("sums", self.discount), lambda: self._all_sums(width))
+        size = max(1, self.rows // (1 if sums is not None else self.steps))
+        for part in _chunks(len(self.bank), size):
+            some = self._sums(part) if sums is None else sums[part]
+            scores[:, part] = heads @ some.to(self.dtype).T
+
+    def _all_sums(self, width: int) -> Tensor:
+        sums = torch.empty(len(self.bank), width, device=self.weight.device)
+        for part in _chunks(len(sums), max(1, self.rows // self.steps)):
+            sums[part] = self._sums(part)
+        return sums
+
+    def _sums(self, part: slice) -> Tensor:
+        """Discounted sums of features, apart for each choice, ``[P, K * F]``."""
+        row, action = self.bank.row[part], self.bank.action[part]
+        features: Tensor = self.trunk(self.bank.observation[row])
+        chosen = F.one_hot(action, self.spec.action_dim) * self.weight.unsqueeze(1)
+        return (chosen.mT @ features).flatten(1)
+
+    def walk(self, scores: Tensor) -> None:
+        """Look at every step of every segment."""
+        bank, spec = self.bank, self.spec
+        features = self._features()
+        for part in _chunks(len(bank), max(1, self.rows // self.steps)):
+            seen = self._see(bank.row[part].flatten(), features)
+            action = bank.action[part].flatten(0, 1)
+            for members in _chunks(len(scores), self.members):
+                output = _apply(_some(self.layers, members), seen)
+                value = spec.step_scores(output.float(), action).unflatten(1, (-1, self.steps))
+                scores[members, part] = value @ self.weight
+
+    def _features(self) -> Tensor | None:
+        """The trunk's outputs at all distinct observations, if they may be kept."""
+        if not len(self.trunk):
+            return self.bank.observation
+        width = self.spec.hidden[-1]
+        if len(self.bank.observation) * width > self.numbers // 2:
+            return None
+        return self._keep(("features",), lambda: self._all_features(width))
+
+    def _all_features(self, width: int) -> Tensor:
+        observation = self.bank.observation
+        features = torch.empty(len(observation), width, device=observation.device)
+        for part in _chunks(len(features), self.rows):
+            features[part] = self.trunk(observation[part])
+        return features
+
+    def _keep(self, purpose: tuple[object, ...], make: Callable[[], Tensor]) -> Tensor:
+        return self.population._seen.get(self.trunk, self.bank, purpose, make)
+
+    def _see(self, rows: slice | Tensor, features: Tensor | None) -> Tensor:
+        """Features at these rows of the distinct observations."""
+        seen = self.trunk(self.bank.observation[rows]) if features is None else features[rows]
+        return seen.to(self.dtype)

@@ -60,40 +60,51 @@ def lockstep(
         raise ValueError(f"seeds must be one per environment ({len(envs)}), got {len(seeds)}")
     starts = [env.reset(seed=int(seed)) for env, seed in zip(envs, seeds, strict=True)]
     observation = np.stack([np.asarray(start[0], dtype=np.float32) for start in starts])
-    info = [numeric_info(start[1]) for start in starts]
+    infos = [start[1] for start in starts]
+    names = list(numeric_info(infos[0]))
+    steps = [env.step for env in envs]
+    info = _stack_info(infos, names)
     alive = np.ones(len(envs), dtype=bool)
-    frames: list[TensorDict] = []
+    frames: list[tuple[Tensor, Tensor, np.ndarray, np.ndarray, dict[str, Tensor]]] = []
     for _ in range(max_steps):
-        current = TensorDict(
-            {OBSERVATION: torch.from_numpy(observation), INFO: _stack_info(info)}, [len(envs)]
-        )
+        seen = torch.from_numpy(observation)
+        current = TensorDict({OBSERVATION: seen, INFO: TensorDict(info, len(envs))}, len(envs))
         action = act(current)
         commands = action.numpy()
         reward, mask = np.zeros(len(envs), dtype=np.float32), alive.copy()
         observation = observation.copy()
-        for index in np.flatnonzero(alive).tolist():
-            outcome = envs[index].step(commands[index])
-            observation[index], reward[index] = outcome[0], outcome[1]
-            info[index] = numeric_info(outcome[4])
-            alive[index] = not (outcome[2] or outcome[3])
-        frame = {
-            OBSERVATION: current[OBSERVATION],
-            ACTION: action,
-            REWARD: torch.from_numpy(reward),
-            INFO: _stack_info(info),
-            MASK: torch.from_numpy(mask),
-        }
-        frames.append(TensorDict(frame, [len(envs)]))
+        for index in mask.nonzero()[0].tolist():
+            outcome = steps[index](commands[index])
+            observation[index], reward[index], ended, cut, infos[index] = outcome
+            if ended or cut:
+                alive[index] = False
+        info = _stack_info(infos, names)
+        frames.append((seen, action, reward, mask, info))
         if not alive.any():
             break
-    episodes: TensorDict = torch.stack(frames, 1)  # type: ignore[call-overload]
+    observations, actions, rewards, masks, about = zip(*frames, strict=True)
+    episodes = TensorDict(
+        {
+            OBSERVATION: torch.stack(observations, 1),
+            ACTION: torch.stack(actions, 1),
+            REWARD: torch.from_numpy(np.stack(rewards, 1)),
+            INFO: {name: torch.stack([each[name] for each in about], 1) for name in names},
+            MASK: torch.from_numpy(np.stack(masks, 1)),
+        },
+        [len(envs), len(frames)],
+    )
     gone = ~episodes[MASK]
-    for value in episodes.values(True, True):
-        value[gone] = 0
+    if gone.any():
+        for value in episodes.values(True, True):
+            value[gone] = 0
     return episodes
 
 
-def _stack_info(info: Sequence[dict[str, float | int]]) -> TensorDict:
-    names = info[0].keys()
-    columns = {name: torch.tensor([entry[name] for entry in info]) for name in names}
-    return TensorDict(columns, [len(info)])
+def _stack_info(infos: Sequence[dict[str, Any]], names: Sequence[str]) -> dict[str, Tensor]:
+    """Column ``[B]`` of each name: bool, int64 or float32."""
+    columns = {}
+    for name in names:
+        column = np.array([info[name] for info in infos])
+        kind = {"b": np.bool_, "i": np.int64, "u": np.int64}.get(column.dtype.kind, np.float32)
+        columns[name] = torch.from_numpy(column.astype(kind, copy=False))
+    return columns

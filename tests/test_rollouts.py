@@ -92,6 +92,27 @@ def test_two_episodes_by_hand():
     assert asked == [([1, 3], [1, 3]), ([0, 2], [0, 2]), ([0, 1], [0, 1])]
 
 
+def test_infos_become_columns_of_three_kinds():
+    class Kinds(Countdown):
+        def info(self):
+            return {
+                "int": np.int8(self.left),
+                "float": np.float64(0.5),
+                "bool": np.bool_(True),
+                "text": "no",
+            }
+
+    info = lockstep([Kinds(2), Kinds(1)], always_zero, seeds=[0, 1], max_steps=4)["info"]
+    assert {name: value.dtype for name, value in info.items()} == {
+        "int": torch.int64,
+        "float": torch.float32,
+        "bool": torch.bool,
+    }
+    assert info["int"].tolist() == [[1, 0], [0, 0]]
+    assert info["float"].tolist() == [[0.5, 0.5], [0.5, 0.0]]
+    assert info["bool"].tolist() == [[True, True], [True, False]]
+
+
 def test_an_episode_is_cut_after_max_steps():
     episodes = lockstep([Countdown(9)], always_zero, seeds=[0], max_steps=4)
     assert episodes[MASK].tolist() == [[True] * 4]
