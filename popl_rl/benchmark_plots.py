@@ -1,0 +1,216 @@
+"""Figures of a benchmark: how well each method serves the groups, and what changes it."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import NullLocator, PercentFormatter
+from numpy.typing import NDArray
+
+from popl_rl.benchmark import worst
+from popl_rl.plots import _LEGEND, PALETTE, _beside, _headline, _tidy
+from popl_rl.report import interval
+from popl_rl.suite import Suite
+
+__all__ = ["scenario_bars", "sweep_panels"]
+
+_COLOURS = tuple(PALETTE[name] for name in ("blue", "vermilion", "green", "purple", "sky"))
+_MARKERS = ("o", "s", "^", "D", "v")
+_BASELINES = {
+    "cpl": PALETTE["orange"],
+    "bradley_terry": PALETTE["orange"],
+    "oracle": PALETTE["black"],
+}
+_LOWEST, _HIGHEST = -0.5, 1.25  # recoveries beyond are cut off
+
+
+def _styles(suite: Suite, methods: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """Colour and marker of each method: a suite's own have the same in all of its figures."""
+    free = ((colour, marker) for marker, colour in itertools.product(_MARKERS, _COLOURS))
+    found = dict(zip(suite.methods, free, strict=False))
+    for name in methods:
+        if name in _BASELINES:
+            found[name] = (_BASELINES[name], "x")
+        elif name not in found:
+            base = name.removesuffix("_lexicase")
+            found[name] = found[base] if base in found else next(free)
+    return found
+
+
+def _columns(fig: Figure) -> int:
+    """Entries of a legend that fit beside each other."""
+    return max(1, int(fig.get_figwidth() / 2.8))
+
+
+def scenario_bars(suite: Suite, results: pd.DataFrame) -> Figure:
+    """Recovery of the worst-served group: a bar for each scenario and method.
+
+    Args:
+        suite: The suite.
+        results: Rows as of :func:`popl_rl.benchmark.collect`; scenarios and methods without
+            recoveries are left out.
+
+    Returns:
+        Bars of means over seeds with their 95 % intervals, and a dot for each seed.
+
+    Raises:
+        ValueError: If no recovery is known.
+    """
+    table = worst(results)
+    if table.empty:
+        raise ValueError("results must hold the recovery of some method in every group, got none")
+    methods = suite.ordered(list(table["method"].unique()))
+    scenarios = list(table["scenario"].unique())
+    fig = Figure(figsize=(max(5.0, len(scenarios) * (0.28 * len(methods) + 0.35)) + 2.4, 4.4))
+    _headline(
+        fig,
+        "How well is the worst-served group served?",
+        "Recovery: (return − random) / (oracle's return − random), cut off below −0.5.\n"
+        "Dots are seeds, bars their mean with its 95 % interval.",
+    )
+    ax = fig.subplots()
+    width = 0.84 / len(methods)
+    styles = _styles(suite, methods)
+    for index, method in enumerate(methods):
+        label = suite.label(method)
+        colour = styles[method][0]
+        catered_otherwise = method.endswith("_lexicase") and method not in suite.methods
+        for place, scenario in enumerate(scenarios):
+            chosen = (table["method"] == method) & (table["scenario"] == scenario)
+            values = table.loc[chosen, "value"].to_numpy(dtype=float)
+            if not len(values):
+                continue
+            x = place + (index - (len(methods) - 1) / 2) * width
+            mean, half = interval(values)
+            ax.bar(
+                x,
+                np.clip(mean, _LOWEST, _HIGHEST),
+                0.9 * width,
+                label=label,
+                color="white" if catered_otherwise else colour,
+                edgecolor=colour,
+                hatch="////" if catered_otherwise else None,
+            )
+            label = "_" + label  # one entry in the legend is enough
+            if len(values) > 1:
+                ax.errorbar(x, mean, half, color="black", linewidth=1, capsize=2)
+                ax.scatter(np.full(len(values), x), values, s=7, color=PALETTE["grey"], zorder=3)
+    ax.axhline(1, color="black", linewidth=1, linestyle="--", zorder=0)
+    ax.axhline(0, color="black", linewidth=1)
+    _beside(ax, "as good as the oracle", 1, "black")
+    _beside(ax, "as good as\nrandom actions", 0, "black")
+    low = _LOWEST if table["value"].min() < 0 else 0.0
+    ax.set(ylabel="recovery", ylim=(low, _HIGHEST))
+    ax.set_xticks(range(len(scenarios)), [name.replace("_", "\n", 1) for name in scenarios])
+    ax.tick_params(axis="x", length=0)
+    fig.legend(loc="outside lower center", ncols=_columns(fig), **_LEGEND)
+    _tidy(ax)
+    return fig
+
+
+def sweep_panels(suite: Suite, results: pd.DataFrame) -> Figure:
+    """Accuracy along each axis of a suite: a column of panels per axis, a row per group.
+
+    Args:
+        suite: A suite with axes.
+        results: Rows as of :func:`popl_rl.benchmark.collect`.
+
+    Returns:
+        A line for each method that runs along the axis: solid for what new raters are given,
+        with 95 % intervals
+        over seeds as bands; dashed for the best member.
+
+    Raises:
+        ValueError: If no method has accuracies at two points of an axis.
+    """
+    table = results[results["measure"].isin(["accuracy", "best_accuracy"])]
+    # Of what methods are compared with, only what bounds them: more lines cannot be read.
+    shown = table["method"].isin([*suite.methods, *_BASELINES])
+    table = table[shown & table["value"].notna()]
+    drawn = {}
+    for axis, points in suite.axes().items():
+        of_axis = table[table["scenario"].isin(list(points))]
+        along = of_axis.groupby("method")["scenario"].transform("nunique") > 1
+        if along.any():
+            drawn[axis] = of_axis[along]
+    if not drawn:
+        raise ValueError("results must hold accuracies at two points of an axis, got none")
+    found = pd.concat(drawn.values())
+    groups = list(found["group"].unique())
+    methods = suite.ordered(list(found["method"].unique()))
+    styles = _styles(suite, methods)
+    fig = Figure(figsize=(max(2.5 * len(drawn) + 0.8, 5.0), 2.1 * len(groups) + 1.8))
+    _headline(
+        fig,
+        "How well is each group understood?",
+        "Solid: by what new raters are given, with 95 % intervals over seeds.\n"
+        "Dashed: by the best member.",
+    )
+    axes = fig.subplots(len(groups), len(drawn), squeeze=False, sharex="col", sharey=True)
+    for column, (axis, rows) in enumerate(drawn.items()):
+        points = {
+            name: x for name, x in suite.axes()[axis].items() if name in set(rows["scenario"])
+        }
+        x = _positions(list(points.values()))
+        for row, group in enumerate(groups):
+            ax = axes[row, column]
+            of_group = rows[rows["group"] == group]
+            for method in methods:
+                _curves(ax, of_group[of_group["method"] == method], points, x, styles[method])
+            ax.set_xticks(x, [str(value) for value in points.values()])
+            ax.xaxis.set_minor_locator(NullLocator())
+            ax.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
+            ax.axhline(0.5, color=PALETTE["grey"], linewidth=0.8, linestyle=":")
+            _tidy(ax)
+            if column == 0:
+                ax.set_ylabel(f"accuracy on\n“{group}”")
+        axes[-1, column].set_xlabel(axis)
+    handles = [
+        Line2D([], [], color=styles[name][0], marker=styles[name][1], label=suite.label(name))
+        for name in methods
+    ]
+    fig.legend(handles=handles, loc="outside lower center", ncols=_columns(fig), **_LEGEND)
+    return fig
+
+
+def _curves(
+    ax: Axes,
+    rows: pd.DataFrame,
+    points: Mapping[str, float | str],
+    positions: NDArray[np.float64],
+    style: tuple[str, str],
+) -> None:
+    """The lines of one method and group, with bands where there are several seeds."""
+    colour, marker = style
+    lines: dict[str, Any] = {
+        "accuracy": {"linestyle": "-", "marker": marker, "markersize": 4},
+        "best_accuracy": {"linestyle": "--", "linewidth": 1},
+    }
+    for measure, look in lines.items():
+        of_measure = rows[rows["measure"] == measure]
+        values = {
+            name: one["value"].to_numpy(float) for name, one in of_measure.groupby("scenario")
+        }
+        here = [name in values for name in points]
+        if not any(here):
+            continue
+        means, halves = np.array([interval(values[name]) for name in points if name in values]).T
+        ax.plot(positions[here], means, color=colour, **look)
+        if measure == "accuracy":
+            low, high = means - halves, means + halves
+            ax.fill_between(positions[here], low, high, color=colour, alpha=0.15, linewidth=0)
+
+
+def _positions(values: Sequence[float | str]) -> NDArray[np.float64]:
+    """Places on a linear axis: logarithms of values that differ fivefold, steps for words."""
+    if any(isinstance(value, str) for value in values):
+        return np.arange(len(values), dtype=float)
+    numbers = np.array(values, dtype=float)
+    if numbers.min() > 0 and numbers.max() >= 5 * numbers.min():
+        numbers = np.log10(numbers)
+    return numbers

@@ -1,0 +1,134 @@
+"""One cell of a benchmark: trained, resumed, or left as it is when it is finished."""
+
+import contextlib
+import copy
+import fcntl
+import logging
+import shutil
+import time
+import traceback
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
+
+from popl_rl.benchmark import Cell, is_finished
+from popl_rl.config import validate
+from popl_rl.runs import write_json
+from popl_rl.trainers import train_popl
+from popl_rl.trainers.command import USER_ERRORS
+
+# One core for each cell; a benchmark's own report takes the place of a log of each.
+_ALWAYS = ("logger=csv", "threads=1")
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a worker is given: a cell, the benchmark's folder, and the cell's configuration."""
+
+    cell: Cell
+    run_dir: Path
+    config: Any
+
+
+def make_tasks(cells: Sequence[Cell], run_dir: Path) -> list[Task]:
+    """Compose the configuration of every cell, so that mistakes are found before anything runs.
+
+    Raises:
+        ValueError: If a configuration does not compose or is not valid, with a name of its cell.
+    """
+    configs: dict[tuple[str, ...], Any] = {}
+    for cell in cells:
+        if cell.overrides in configs:
+            continue
+        try:
+            configs[cell.overrides] = _compose([*cell.overrides, *_ALWAYS])
+            validate(configs[cell.overrides])
+        except USER_ERRORS as error:
+            raise ValueError(f"cell {cell.name} cannot be run: {error}") from error
+    return [Task(cell, run_dir, configs[cell.overrides]) for cell in cells]
+
+
+def run_task(task: Task) -> str | None:
+    """Run a cell in whatever process this is; what it prints goes to a file in ``logs``.
+
+    Returns:
+        What went wrong, or None.
+    """
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    log = task.run_dir / "logs" / f"{task.cell.name}.txt"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    problem = None
+    with _alone(log.with_suffix(".lock")):
+        with (
+            log.open("w", encoding="utf-8") as file,
+            contextlib.redirect_stdout(file),
+            contextlib.redirect_stderr(file),
+        ):
+            try:
+                # Another machine may have run it while this one waited.
+                if not is_finished(task.cell, task.run_dir):
+                    _train(task)
+            except Exception as error:
+                traceback.print_exc()
+                kind = "" if isinstance(error, USER_ERRORS) else f"{type(error).__name__}: "
+                problem = f"{kind}{error} (see {log})"
+        if log.stat().st_size == 0:
+            log.unlink()
+    return problem
+
+
+def _compose(overrides: Sequence[str]) -> Any:
+    if GlobalHydra.instance().is_initialized():  # inside of a Hydra job
+        return compose("train", overrides=list(overrides))
+    with initialize_config_module("popl_rl.configs", version_base="1.3"):
+        return compose("train", overrides=list(overrides))
+
+
+@contextlib.contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Wait until no other process has this lock, even on another machine; killed ones have none."""
+    with path.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _train(task: Task) -> None:
+    cell, folder = task.cell, task.cell.folder(task.run_dir)
+    config = copy.deepcopy(task.config)
+    config.seed, config.run_dir = cell.seed, str(folder)
+    if cell.source is not None:
+        source = cell.source.folder(task.run_dir)
+        config.data.load, config.data.save = str(source / "data"), False
+        if (source / "baselines").is_dir():
+            config.evaluation.baselines_from = str(source / "baselines")
+    if not cell.rivals:
+        config.evaluation.reward_baselines = False
+    seconds = None
+    if not _resume(config, folder):
+        shutil.rmtree(folder, ignore_errors=True)
+        started = time.perf_counter()
+        train_popl.run(config)
+        seconds = round(time.perf_counter() - started, 2)
+    # Last, as a sign that the cell is finished.
+    write_json(folder / "cell.json", {**cell.record(), "seconds": seconds})
+
+
+def _resume(config: Any, folder: Path) -> bool:
+    """Finish what a killed process has left, if that is the same run; whether it worked."""
+    stored = folder / "config.yaml"
+    same = stored.is_file() and stored.read_text("utf-8") == OmegaConf.to_yaml(config, resolve=True)
+    if not same:
+        return False
+    again = copy.deepcopy(config)
+    again.resume = str(folder)
+    try:
+        train_popl.run(again)
+    except Exception:
+        traceback.print_exc()
+        return False
+    return True
