@@ -78,7 +78,6 @@ class MethodConfig:
     variation: str = "auto"  # gradient, gaussian (published), teams; auto goes by the cases
     evolve: str = "all"  # all: whole networks; head: last layers on a shared, frozen trunk
     features: str = "random"  # that trunk: random (published), or pooled: trained on all answers
-    feature_steps: int = 500  # steps of that training (pooled)
     members: int = 32  # policies in the population
     generations: int = 100
     hidden: list[int] = field(default_factory=lambda: [64, 64])  # units of each hidden layer
@@ -86,7 +85,10 @@ class MethodConfig:
     alpha: float = 0.5  # scale of the scores (CPL's temperature)
     conservatism: float = 0.9  # lambda of the CPL loss, in (0, 1]; 1 for reward functions
     discount: float = 1.0  # per-step discount of the scores
-    warm_up: int = 20  # pooled CPL steps before the first generation
+    warm_up: int = 20  # CPL steps on all answers before the first generation (without kinship)
+    kinship: bool = True  # children learn from raters akin to whom they are for (gradient, ids)
+    pooled_steps: int = 200  # CPL steps on all answers: features=pooled, or before specialists
+    specialist_steps: int = 30  # CPL steps of the specialist for each rater (kinship)
     steps: int = 15  # CPL steps of each child (gradient)
     batch_size: int = 256  # preferences per CPL step and member (gradient)
     learning_rate: float = 2e-3  # of Adam (gradient)
@@ -194,7 +196,8 @@ def validate(config: Config) -> None:
     at_least_one(evaluation, "evaluation", "episodes", "new_raters", "answers", "pairs")
     at_least_one(evaluation, "evaluation", "baseline_steps", "baseline_batch_size")
     at_least_one(method, "method", "generations", "steps", "batch_size")
-    at_least_one(method, "method", "teams", "team_generations", "feature_steps")
+    at_least_one(method, "method", "teams", "team_generations", "pooled_steps")
+    at_least_one(method, "method", "specialist_steps")
     at_least_one(evaluation, "evaluation", "ppo_frames", "brex_steps", "dpl_steps")
     expect(evaluation.menu >= 2, "evaluation.menu", "at least 2, to choose", evaluation.menu)
     for name, value, known in (

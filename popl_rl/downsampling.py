@@ -16,7 +16,7 @@ from torch import Tensor
 
 from popl_rl.lexicase import _check_count, _check_generator, _check_scores
 
-__all__ = ["downsample", "informed_downsample"]
+__all__ = ["downsample", "informed_downsample", "spread_out"]
 
 # Candidates examined together: enough to fill a matrix product, few enough to fit into memory.
 _BATCH = 64
@@ -106,3 +106,25 @@ def informed_downsample(
         likeness = torch.maximum(likeness, (vectors @ vectors[new].T).amax(1))
         likeness[kept] = torch.inf
     return kept
+
+
+def spread_out(kin: Tensor, count: int, *, generator: torch.Generator) -> Tensor:
+    """Choose raters unlike each other: farthest first, from a random one.
+
+    As informed down-sampling does with cases (Boldi et al., 2024), it keeps what is rare in sight.
+
+    Args:
+        kin: Correlations ``[C, C]``.
+        count: Raters to choose, at least 1; more than C repeat.
+        generator: Source of the first one.
+
+    Returns:
+        ``[count]``.
+    """
+    start = int(torch.randint(len(kin), (), generator=generator, device=generator.device))
+    chosen, nearest = [start], kin[start].clone()
+    for _ in range(count - 1):
+        farthest = int(nearest.argmin())
+        chosen.append(farthest)
+        nearest = torch.maximum(nearest, kin[farthest])
+    return torch.tensor(chosen, device=kin.device)

@@ -22,6 +22,7 @@ from popl_rl.config import (
     parse_epsilon,
 )
 from popl_rl.keys import ACTION, ANSWER, GROUP, INFO, OBSERVATION, Answer
+from popl_rl.kinship import seed_with_specialists
 from popl_rl.losses import CPLLoss
 from popl_rl.policies import PolicySpec, build_network
 from popl_rl.policy_set import HypothesisSet, as_set, load_set
@@ -247,6 +248,7 @@ def build_popl(
         networks[0] = _pooled_network(config, spec, bank, comparisons, generator=generator)
     population = Population(networks, spec, evolve=cast("Any", config.evolve))
     population = population.to(bank.row.device)
+    kin: torch.Tensor | None = None
     if variation_of(config) == "gaussian":
         variation: GaussianHead | GradientCPL = GaussianHead(
             population, std=config.mutation_std, generator=generator
@@ -268,7 +270,21 @@ def build_popl(
             batch_size=config.batch_size,
             generator=generator,
         )
-        variation.warm_up(config.warm_up)
+        if config.kinship and config.cases == "rater":
+            pooled = networks[0]
+            if config.evolve == "all":
+                pooled = _pooled_network(config, spec, bank, comparisons, generator=generator)
+            kin = seed_with_specialists(
+                population,
+                pooled,
+                loss,
+                comparisons,
+                steps=config.specialist_steps,
+                learning_rate=config.learning_rate / 2,
+                generator=generator,
+            )
+        else:
+            variation.warm_up(config.warm_up)
     return POPL(
         population,
         bank,
@@ -277,6 +293,7 @@ def build_popl(
         alpha=config.alpha,
         discount=config.discount,
         epsilon=cast("Any", parse_epsilon(config.epsilon)),
+        kin=kin,
         generator=generator,
     )
 
@@ -295,7 +312,8 @@ def _pooled_network(
         bank,
         comparisons,
         torch.ones(1, len(comparisons), device=bank.row.device),
-        steps=config.feature_steps,
+        steps=config.pooled_steps,
+        learning_rate=config.learning_rate,
         alpha=config.alpha,
         conservatism=config.conservatism if isinstance(spec, PolicySpec) else 1.0,
         discount=config.discount,
@@ -356,11 +374,13 @@ def train_baselines(
     """
     if config.baselines_from is not None:
         loaded = load_set(config.baselines_from)
-        if len(loaded) != 1 + num_groups or loaded.population.spec != spec:
+        own = loaded.population.spec
+        # Other hidden layers do: baselines need not be built as the members are.
+        kinds = [(type(s), s.observation_dim, s.action_dim, s.discrete) for s in (own, spec)]
+        if len(loaded) != 1 + num_groups or kinds[0] != kinds[1]:
             raise ValueError(
                 f"evaluation.baselines_from: {config.baselines_from} holds {len(loaded)} of "
-                f"{loaded.population.spec}, expected {1 + num_groups} of {spec}; name a run on the "
-                "same data"
+                f"{own}, expected {1 + num_groups} of {spec}; name a run on the same data"
             )
         loaded.population.to(bank.row.device)
         return loaded

@@ -27,7 +27,12 @@ from torch import Tensor
 
 from popl_rl._pools import Epsilon, PassPools, Round, ScorePools, select_dynamically
 
-__all__ = ["SelectionReport", "lexicase_report", "lexicase_selection"]
+__all__ = [
+    "SelectionReport",
+    "lexicase_given_first",
+    "lexicase_report",
+    "lexicase_selection",
+]
 
 _DTYPES = (
     torch.bool,
@@ -177,6 +182,53 @@ def lexicase_report(
         distinct=len(first),
         effective=1 / float(shares.square().sum()),
     )
+
+
+def lexicase_given_first(
+    scores: Tensor,
+    first: Tensor,
+    *,
+    epsilon: Tensor | float | None = None,
+    generator: torch.Generator,
+) -> SelectionReport:
+    """Select parents in random orders of which the first case is given.
+
+    With ``first`` drawn uniformly, parents are distributed as those of `lexicase_selection` with
+    the same (semi-dynamic) epsilon.
+
+    Args:
+        scores: ``[member, case]``, as for `lexicase_selection`.
+        first: Case that each selection begins with, ``[num_selected]``, int64.
+        epsilon: How far behind the best a member may be: a number, a tensor ``[case]``, or None.
+        generator: Source of all randomness, on the device of ``scores``.
+
+    Returns:
+        The parents in the order of ``first``, and how their selection went.
+
+    Raises:
+        TypeError: As `lexicase_selection`.
+        ValueError: As `lexicase_selection`, or if a first case does not exist.
+    """
+    _check_scores(scores)
+    num_cases = scores.shape[1]
+    if first.ndim != 1 or not len(first) or not bool(((first >= 0) & (first < num_cases)).all()):
+        raise ValueError(f"first must hold cases in 0..{num_cases - 1}, [selection], got {first}")
+    _check_generator(generator, scores.device)
+    tolerance = _tolerance(0.0 if epsilon is None else epsilon, scores)
+    values = scores.to(tolerance.dtype)
+    parents, depth = torch.empty_like(first), torch.empty_like(first)
+    cases, group = first.unique(return_inverse=True)
+    for number, case in enumerate(cases.tolist()):
+        column = values[:, case]
+        pool = (column >= column.max() - tolerance[case]).nonzero().squeeze(-1)
+        mine = (group == number).nonzero().squeeze(-1)
+        # Coming back to the first case removes nobody, so the pool may meet all cases.
+        rest = lexicase_report(values[pool], len(mine), epsilon=tolerance, generator=generator)
+        parents[mine] = pool[rest.parents]
+        depth[mine] = rest.depth + int(len(pool) < len(scores))
+    labels, behaviours = _label_behaviours(scores)
+    shares = labels[parents].bincount() / len(parents)
+    return SelectionReport(parents, depth, len(behaviours), 1 / float(shares.square().sum()))
 
 
 def _prepare(

@@ -10,10 +10,19 @@ import torch
 from torch import Tensor
 
 from popl_rl.comparisons import Comparisons
-from popl_rl.lexicase import lexicase_report
+from popl_rl.downsampling import spread_out
+from popl_rl.lexicase import lexicase_given_first, lexicase_report
 from popl_rl.population import Population, segment_scores
 from popl_rl.segments import SegmentBank
 from popl_rl.variation import Variation
+
+#: What a child learns from kin on whom its parent is weak, against 1 where it is strong. Without
+#: it a first child for a small group learns from the one or two raters that its parent happens to
+#: pass; much more of it blurs groups that are each other's nearest.
+#: What a child learns from kin on whom its parent is weak, against 1 where it is strong. Without
+#: it a first child for a small group learns from the one or two raters that its parent happens to
+#: pass; much more of it blurs groups that are each other's nearest.
+_FLOOR = 0.2
 
 __all__ = ["POPL", "case_values", "margins", "rater_accuracy"]
 
@@ -65,6 +74,10 @@ class POPL:
         alpha: Scale of the scores, as in the CPL loss.
         discount: Per-step discount of the scores.
         epsilon: Tolerance of lexicase selection; ``"mad"``, a number, or None for none.
+        kin: How alike the raters want, ``[C, C]`` in [-1, 1] (see :mod:`popl_rl.kinship`). If
+            given, a child is selected for one rater, whose case comes first in its order, and
+            learns from raters akin to that one. Half of these raters are random, the others unlike
+            each other, so that small groups are not overlooked.
         generator: Source of all randomness.
 
     Attributes:
@@ -81,6 +94,7 @@ class POPL:
         alpha: float = 0.5,
         discount: float = 1.0,
         epsilon: float | Literal["mad"] | None = "mad",
+        kin: Tensor | None = None,
         generator: torch.Generator,
     ) -> None:
         self.population = population
@@ -90,6 +104,7 @@ class POPL:
         self.alpha = alpha
         self.discount = discount
         self.epsilon = epsilon
+        self.kin = kin
         self.generator = generator
         self.generation = 0
 
@@ -107,11 +122,20 @@ class POPL:
         passes = margin > 0
         values = case_values(passes, self.comparisons)
         tolerance = mad(values) if self.epsilon == "mad" else self.epsilon
-        report = lexicase_report(
-            values, len(self.population), epsilon=tolerance, generator=self.generator
-        )
         strong = values >= values.amax(0) - (0.0 if tolerance is None else tolerance)
-        varied = self.variation(report.parents, strong.float()[:, self.comparisons.case])
+        first = None if self.kin is None else self._first_raters(self.kin)
+        if first is None:
+            report = lexicase_report(
+                values, len(self.population), epsilon=tolerance, generator=self.generator
+            )
+        else:
+            report = lexicase_given_first(
+                values, first, epsilon=tolerance, generator=self.generator
+            )
+        strength = strong.float()[report.parents]
+        if self.kin is not None and first is not None:
+            strength = (strength + _FLOOR) * self.kin[first].clamp(min=0)
+        varied = self.variation(report.parents, strength[:, self.comparisons.case])
         self.generation += 1
         return {
             "worst_rater_accuracy": rater_accuracy(values),
@@ -121,6 +145,14 @@ class POPL:
             "effective_parents": report.effective,
             **varied,
         }
+
+    def _first_raters(self, kin: Tensor) -> Tensor:
+        """For whom the children are: half at random, half unlike each other, ``[N]``."""
+        spread = len(self.population) // 2
+        shape = (len(self.population) - spread,)
+        device = self.generator.device
+        first = torch.randint(len(kin), shape, generator=self.generator, device=device)
+        return torch.cat([first, spread_out(kin, spread, generator=self.generator)])
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the next generation depends on."""

@@ -28,8 +28,7 @@ class Variation(Protocol):
 
         Args:
             parents: Member that each child copies, ``[N]``.
-            strength: Weight of each comparison for each *parent-to-be*, ``[N, M]``, indexed like
-                the population before the call.
+            strength: How much each child should learn from each comparison, ``[N, M]``.
 
         Returns:
             Scalars to log.
@@ -150,8 +149,8 @@ class GradientCPL:
         """See :class:`Variation`."""
         self.loss.population.replace_(parents)
         inherit_moments(self.optimizer, parents)
-        # A parent that is strong nowhere still needs something to learn from: everything, a bit.
-        weight = strength[parents] + 1e-6
+        # A child of one that is strong nowhere still needs something: everything, a bit.
+        weight = strength + 1e-6
         value = descend(
             self.loss,
             self.optimizer,

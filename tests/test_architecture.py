@@ -28,8 +28,11 @@ LIBRARY = sorted(name for name, path in MODULES.items() if path.parent == PACKAG
 LEARNERS = [
     f"popl_rl.{name}"
     for name in (
+        "brex",
         "comparisons",
+        "dpl",
         "downsampling",
+        "kinship",
         "lexicase",
         "losses",
         "policies",
@@ -42,11 +45,44 @@ LEARNERS = [
 ]
 #: A module of one layer imports modules of earlier layers, or of its own.
 LAYERS = (
-    {"keys", "registry", "config", "lexicase", "_pools", "downsampling", "planning"},
+    {"keys", "registry", "config", "lexicase", "_pools", "downsampling", "planning", "majority"},
     {"raters", "rollouts", "segments", "policies", "rewards", "comparisons"},
     {"preferences", "losses", "population", "variation"},
-    {"popl", "policy_set", "teams", "evaluation", "baselines", "_env_checks", "testing"},
-    {"experiment", "results", "loggers", "plots", "report", "pictures", "runs", "trainer"},
+    {
+        "popl",
+        "policy_set",
+        "teams",
+        "evaluation",
+        "baselines",
+        "brex",
+        "dpl",
+        "kinship",
+        "ppo",
+        "reward_baselines",
+        "_env_checks",
+        "testing",
+    },
+    {
+        "acting",
+        "benchmark",
+        "benchmark_plots",
+        "benchmark_report",
+        "jobs",
+        "likeness",
+        "reward_pictures",
+        "suite",
+        "utility_plots",
+        "experiment",
+        "findings",
+        "results",
+        "loggers",
+        "plots",
+        "report",
+        "pictures",
+        "runs",
+        "trainer",
+        "worlds",
+    },
 )
 
 

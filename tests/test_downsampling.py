@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.stats import chisquare
 from torch import Tensor
 
-from popl_rl.downsampling import downsample, informed_downsample
+from popl_rl.downsampling import downsample, informed_downsample, spread_out
 from popl_rl.lexicase import lexicase_selection
 
 
@@ -191,3 +191,18 @@ def test_sampling_on_cuda():
     off_diagonal = ~torch.eye(20, dtype=torch.bool, device="cuda")
     spread = distances(passes, kept)[off_diagonal].min()
     assert spread > distances(passes, cases)[off_diagonal].min()
+
+
+def test_those_unlike_each_other_are_chosen(generator):
+    """Nine alike and one apart: whoever comes first, the second choice is from the other side."""
+    kin = torch.ones(10, 10)
+    kin[9, :9] = kin[:9, 9] = -1.0
+    for _ in range(5):
+        chosen = spread_out(kin, 2, generator=generator)
+        assert len(chosen) == 2
+        assert (chosen == 9).sum() == 1
+
+
+def test_more_than_there_are_repeat(generator):
+    assert len(spread_out(torch.eye(3), 7, generator=generator)) == 7
+    assert set(spread_out(torch.eye(3), 3, generator=generator).tolist()) == {0, 1, 2}

@@ -170,7 +170,7 @@ def test_a_generation_by_hand(monkeypatch, bank, epsilon, strong):
     comparisons = three_comparisons([0, 0, 1], 2)
     parents, strength, metrics = one_generation(monkeypatch, bank, margin, comparisons, epsilon)
     assert parents.shape == (3,)
-    assert strength.tolist() == strong
+    assert strength.tolist() == [strong[parent] for parent in parents]
     if epsilon is None:
         assert set(parents.tolist()) <= {0, 1}
     assert metrics["worst_rater_accuracy"] == pytest.approx(1.0)
@@ -192,9 +192,9 @@ def test_tolerance_from_the_population_by_hand(monkeypatch, bank):
     rows = torch.arange(8)
     comparisons = Comparisons(rows, rows + 8, rows // 4, 2)
     margin = torch.tensor(passes) - 0.5
-    _, strength, _ = one_generation(monkeypatch, bank, margin, comparisons, "mad")
-    assert strength[:, 0].tolist() == [1, 1, 0]
-    assert strength[:, 4].tolist() == [0, 0, 1]
+    parents, strength, _ = one_generation(monkeypatch, bank, margin, comparisons, "mad")
+    assert strength[:, 0].tolist() == [[1, 1, 0][parent] for parent in parents]
+    assert strength[:, 4].tolist() == [[0, 0, 1][parent] for parent in parents]
     assert torch.equal(strength, strength[:, [0] * 4 + [4] * 4])
 
 

@@ -119,7 +119,7 @@ def test_other_ways_of_learning_them(train, overrides):
 
 
 def test_features_trained_on_everybody(train):
-    result = train("method.evolve=head", "method.features=pooled", "method.feature_steps=20")
+    result = train("method.evolve=head", "method.features=pooled", "method.pooled_steps=20")
     plain = train("method.evolve=head")
     trunks = [r.policies.population.trunk.state_dict()["0.weight"] for r in (result, plain)]
     assert not torch.equal(*trunks)

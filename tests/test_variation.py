@@ -128,11 +128,11 @@ def test_children_start_from_their_parents(whole, bank, comparisons):
     torch.testing.assert_close(flat(whole), before[parents], atol=1e-7, rtol=0)
 
 
-def test_children_learn_from_what_their_parents_are_strong_in(whole, bank, comparisons):
-    """Parent 3 is strong in comparison 5 alone, parent 1 in comparison 7; see what is drawn."""
+def test_children_learn_from_what_they_are_told(whole, bank, comparisons):
+    """Children 0 and 3 are told comparison 5 alone, the others comparison 7; see what is drawn."""
     variation = gradient(whole, bank, comparisons, batch_size=50, steps=1)
     strength = torch.zeros(4, len(comparisons))
-    strength[3, 5] = strength[1, 7] = 1.0
+    strength[[0, 3], 5] = strength[[1, 2], 7] = 1.0
     seen = []
     variation.loss.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
     variation(torch.tensor([3, 1, 1, 3]), strength)
