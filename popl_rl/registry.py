@@ -53,10 +53,10 @@ def rater(name: str) -> Callable[[_T], _T]:
 
     Example:
         >>> from popl_rl.registry import rater, resolve
-        >>> @rater("gentle")
-        ... def gentle(segments):
+        >>> @rater("tender")
+        ... def tender(segments):
         ...     return -segments["action"].square().sum(-1)
-        >>> resolve("rater", "gentle") is gentle
+        >>> resolve("rater", "tender") is tender
         True
     """
     return _decorator("rater", name)

@@ -3,7 +3,7 @@
 From a shell::
 
     python -m popl_rl.testing env two_doors --with doors=3
-    python -m popl_rl.testing rater my_raters.py:gentle --env two_doors
+    python -m popl_rl.testing rater my_raters.py:tender --env two_doors
 
 One line says what is wrong and what to do, with exit code 2, or that nothing is, with exit code 0.
 Importing this module registers nothing.

@@ -13,8 +13,8 @@ LIMIT = 3
 runs = []
 runs.append(1)
 
-@rater("gentle")
-def gentle(segments):
+@rater("tender")
+def tender(segments):
     return segments
 
 class Strict:
@@ -113,7 +113,7 @@ def test_file_and_attribute(file, monkeypatch):
     brisk = resolve("rater", "my_raters.py:brisk")
     assert brisk(3) == 3
     assert resolve("rater", f"{file}:brisk") is brisk
-    assert resolve("rater", "gentle") is resolve("rater", "my_raters.py:gentle")
+    assert resolve("rater", "tender") is resolve("rater", "my_raters.py:tender")
     assert sys.modules[brisk.__module__].runs == [1]
     assert pickle.loads(pickle.dumps(brisk)) is brisk
 
@@ -139,45 +139,45 @@ def test_an_unknown_name_answers_with_the_nearest_the_list_and_the_forms():
 def test_a_missing_attribute_lists_what_there_is(file):
     with pytest.raises(ValueError, match=r"no 'brsk'. Did you mean 'brisk'\?") as caught:
         resolve("rater", "my_raters.py:brsk")
-    assert "It defines: Strict, brisk, gentle." in str(caught.value)
+    assert "It defines: Strict, brisk, tender." in str(caught.value)
 
 
 def test_a_missing_file_lists_its_folder(file):
     with pytest.raises(ValueError, match=r"no Python file .*raters\.py\..*: my_raters\.py\."):
-        resolve("rater", "raters.py:gentle")
+        resolve("rater", "raters.py:tender")
     with pytest.raises(ValueError, match=r"no Python file .*Python files in that folder: none"):
-        resolve("rater", "nowhere/raters.py:gentle")
+        resolve("rater", "nowhere/raters.py:tender")
 
 
 def test_an_error_in_a_file_is_wrapped_and_the_file_can_be_mended(file):
     file.write_text("import json\njson.loads('{')\n")
-    with pytest.raises(ValueError, match=r"my_raters.py:gentle'.*JSONDecodeError") as caught:
-        resolve("rater", "my_raters.py:gentle")
+    with pytest.raises(ValueError, match=r"my_raters.py:tender'.*JSONDecodeError") as caught:
+        resolve("rater", "my_raters.py:tender")
     assert caught.value.__cause__ is not None
     file.write_text(GOOD)
-    assert resolve("rater", "my_raters.py:gentle")(1) == 1
+    assert resolve("rater", "my_raters.py:tender")(1) == 1
 
 
 def test_a_syntax_error_is_wrapped(file):
-    file.write_text("def gentle(:\n")
+    file.write_text("def tender(:\n")
     with pytest.raises(ValueError, match="SyntaxError"):
-        resolve("rater", "my_raters.py:gentle")
+        resolve("rater", "my_raters.py:tender")
 
 
 def test_a_missing_module_suggests_the_file():
     with pytest.raises(ValueError, match=r"Is it installed, .*'no/such_one\.py:\.\.\.'"):
-        resolve("rater", "no.such_one:gentle")
+        resolve("rater", "no.such_one:tender")
 
 
 def test_a_module_that_misses_another_is_not_called_missing(file, monkeypatch):
     monkeypatch.syspath_prepend(str(file.parent))
     (file.parent / "needs_more.py").write_text("import not_there_at_all\n")
     with pytest.raises(ValueError, match="No module named 'not_there_at_all'") as caught:
-        resolve("rater", "needs_more:gentle")
+        resolve("rater", "needs_more:tender")
     assert "Is it installed" not in str(caught.value)
 
 
-@pytest.mark.parametrize("reference", ["my_raters.py:", ":gentle"])
+@pytest.mark.parametrize("reference", ["my_raters.py:", ":tender"])
 def test_incomplete_references(file, reference):
     with pytest.raises(ValueError, match=r"is incomplete\. A reference is"):
         resolve("rater", reference)
@@ -203,7 +203,7 @@ def test_a_forgotten_name_is_reported():
     with pytest.raises(ValueError, match=r"@rater needs a name.*@rater\('my_rater'\)"):
 
         @rater
-        def gentle(segments):
+        def tender(segments):
             return segments
 
 

@@ -1,0 +1,163 @@
+"""Segments to compare: several behaviours, each continuing from the same state of the simulator.
+
+Of two clips that begin alike, what differs is what was done; of two from anywhere, mostly how far
+the episode had come.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from popl_rl.envs._metaworld_scripts import Scripted
+from popl_rl.envs.metaworld_tasks import MetaworldTask, TaskState
+from popl_rl.keys import ACTION, INFO, OBSERVATION, REWARD
+
+__all__ = ["check_scripted", "collect_continuations"]
+
+
+def collect_continuations(
+    env: MetaworldTask,
+    *,
+    starts: int,
+    per_start: int = 4,
+    length: int = 64,
+    starts_per_episode: int = 6,
+    generator: torch.Generator,
+    progress: Callable[[int], None] | None = None,
+) -> TensorDict:
+    """Collect segments of which ``per_start`` at a time begin in one state.
+
+    Episodes of the environment's rough behaviours are run until the task is done. Where they begin,
+    and states drawn uniformly from them, is where its scripted behaviours, each of a different
+    speed, go on from.
+
+    Args:
+        env: Environment to collect in.
+        starts: States to begin from.
+        per_start: Segments from each, at most as many as there are scripted behaviours.
+        length: Steps T of a segment. One that does the task sooner goes on to the end.
+        starts_per_episode: States taken from one episode.
+        generator: Source of seeds, of choices and of the behaviours' randomness.
+        progress: Called with the number of segments collected so far.
+
+    Returns:
+        TensorDict ``[starts * per_start, T]``; segments of one start follow each other, and
+        ``("info", "start")`` numbers the starts.
+
+    Raises:
+        ValueError: If a count is not positive or ``per_start`` exceeds the behaviours.
+    """
+    behaviours = env.behaviours()
+    styles = [what for name, what in behaviours.items() if name.startswith("scripted/")]
+    leads = [what for name, what in behaviours.items() if name.startswith("rough/")]
+    if not 1 <= per_start <= len(styles):
+        raise ValueError(f"per_start must be 1 to {len(styles)}, got {per_start}.")
+    counts = {"starts": starts, "length": length, "starts_per_episode": starts_per_episode}
+    for name, value in counts.items():
+        if value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}.")
+    segments: list[TensorDict] = []
+    while len(segments) < starts * per_start:
+        seed = int(torch.randint(2**31, (), generator=generator))
+        lead = leads[int(torch.randint(len(leads), (), generator=generator))]
+        visited, _ = _episode(env, lead, seed, generator)
+        # Always the reset: a policy acts from there every time, and few states look like it.
+        later = 1 + torch.randperm(len(visited) - 1, generator=generator)
+        chosen = torch.cat([torch.zeros(1, dtype=torch.long), later])[:starts_per_episode]
+        for index in chosen.tolist():
+            start = len(segments) // per_start
+            if start == starts:
+                break
+            for style in torch.randperm(len(styles), generator=generator)[:per_start].tolist():
+                steps = _continue(env, visited[index], styles[style], length, generator)
+                steps[INFO, "start"] = torch.full((length,), start)
+                segments.append(steps)
+            if progress is not None:
+                progress(len(segments))
+    collected: TensorDict = torch.stack(segments)  # type: ignore[call-overload]
+    return collected
+
+
+def check_scripted(
+    env: MetaworldTask, *, episodes: int = 10, least: float = 0.5, seed: int = 0
+) -> dict[str, float]:
+    """Measure how often the environment's behaviours do the task, and refuse if they rarely do.
+
+    Args:
+        env: Environment to try them in.
+        episodes: Episodes of each behaviour.
+        least: Share of successes that each scripted behaviour must reach; rough ones need not.
+        seed: Seed of starts and noise.
+
+    Returns:
+        Share of successes within ``env.max_steps`` by behaviour.
+
+    Raises:
+        ValueError: If ``episodes`` is not positive or a scripted behaviour fails too often.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1, got {episodes}.")
+    generator = torch.Generator().manual_seed(seed)
+    rates = {}
+    for name, behaviour in env.behaviours().items():
+        ends = [_episode(env, behaviour, seed + e, generator)[1] for e in range(episodes)]
+        rates[name] = sum(ends) / episodes
+    poor = {k: v for k, v in rates.items() if k.startswith("scripted/") and v < least}
+    if poor:
+        said = ", ".join(f"{name} {rate:.0%}" for name, rate in poor.items())
+        raise ValueError(
+            f"task {env.task!r}: the scripted policy succeeds too rarely to learn from within "
+            f"{env.max_steps} steps ({said} of {episodes} episodes, at least {least:.0%} wanted); "
+            "raise max_steps, or choose another task."
+        )
+    return rates
+
+
+def _episode(
+    env: MetaworldTask, behaviour: Scripted, seed: int, generator: torch.Generator
+) -> tuple[list[TaskState], bool]:
+    """Return every fourth state of an episode until the task is done, and whether it was."""
+    behaviour.reset()
+    observation, _ = env.reset(seed=seed)
+    states = []
+    for time in range(env.max_steps):
+        if time % 4 == 0:
+            states.append(env.get_state())
+        action = behaviour.act(observation[None], generator)[0]
+        observation, _, _, _, info = env.step(action.numpy())
+        if info["success"]:
+            return states, True
+    return states, False
+
+
+def _continue(
+    env: MetaworldTask,
+    state: TaskState,
+    behaviour: Scripted,
+    length: int,
+    generator: torch.Generator,
+) -> TensorDict:
+    behaviour.reset()
+    observation, _ = env.set_state(state)
+    seen, done, rewards = [], [], []
+    infos: list[Mapping[str, Any]] = []
+    for _ in range(length):
+        action = behaviour.act(observation[None], generator)[0]
+        seen.append(observation)
+        done.append(action)
+        observation, reward, _, _, info = env.step(action.numpy())
+        rewards.append(reward)
+        infos.append(info)
+    columns = {name: torch.from_numpy(np.stack([i[name] for i in infos])) for name in infos[0]}
+    return TensorDict(
+        {
+            OBSERVATION: torch.from_numpy(np.stack(seen)),
+            ACTION: torch.stack(done),
+            REWARD: torch.tensor(rewards, dtype=torch.float32),
+            INFO: columns,
+        },
+        [length],
+    )
