@@ -4,7 +4,8 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 
-import popl_rl.trainers.train_popl  # noqa: F401 - makes the schemas known to Hydra
+import popl_rl.trainers.run_benchmark
+import popl_rl.trainers.train_popl  # noqa: F401 - they make the schemas known to Hydra
 from popl_rl.comparisons import Comparisons
 from popl_rl.preferences import collect_preferences
 from popl_rl.raters import Raters, make_groups
