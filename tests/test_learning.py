@@ -38,7 +38,7 @@ def test_each_of_three_hidden_groups_finds_its_policy(tmp_path):
     config.logger.name, config.run_dir = "csv", str(tmp_path / "run")
     recovery, gap = worst(run(config))
     # A third of the answers each is little: the oracles themselves reach 0.36 to 1.00 success, and
-    # the worst group's recovery was 0.69 to 0.94 over five seeds.
+    # the worst group's recovery was 0.63 to 0.92 over five seeds.
     assert recovery["popl"] >= 0.6
     assert recovery["popl"] >= recovery["cpl"] + 0.3
     assert gap["popl"] <= 0.05
