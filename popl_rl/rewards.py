@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from popl_rl.keys import ACTION, OBSERVATION
+from popl_rl.policies import PolicySpec
 from popl_rl.segments import SegmentBank
 
 __all__ = ["RewardSpec", "reward_bank"]
@@ -51,17 +52,10 @@ class RewardSpec:
             TypeError: If observations are not a flat ``Box`` or actions neither ``Discrete`` nor a
                 flat ``Box``.
         """
-        observation, action = env.observation_space, env.action_space
-        if not isinstance(observation, gymnasium.spaces.Box) or len(observation.shape) != 1:
-            raise TypeError(
-                f"observation_space must be a Box of one dimension, got {observation}; flatten it, "
-                "for example with gymnasium.wrappers.FlattenObservation"
-            )
-        if isinstance(action, gymnasium.spaces.Discrete):
-            return cls(observation.shape[0], int(action.n), tuple(hidden))
-        if isinstance(action, gymnasium.spaces.Box) and len(action.shape) == 1:
-            return cls(observation.shape[0] + action.shape[0], 1, tuple(hidden))
-        raise TypeError(f"action_space must be Discrete or a Box of one dimension, got {action}")
+        sizes = PolicySpec.from_env(env, hidden=hidden)
+        if sizes.discrete:
+            return cls(sizes.observation_dim, sizes.action_dim, sizes.hidden)
+        return cls(sizes.observation_dim + sizes.action_dim, 1, sizes.hidden)
 
     @property
     def discrete(self) -> bool:
