@@ -39,6 +39,8 @@ LEARNERS = [
         "popl",
         "population",
         "rewards",
+        "styled_population",
+        "styles",
         "teams",
         "variation",
     )
@@ -47,7 +49,7 @@ LEARNERS = [
 LAYERS = (
     {"keys", "registry", "config", "lexicase", "_pools", "downsampling", "planning", "majority"},
     {"raters", "rollouts", "segments", "policies", "rewards", "comparisons"},
-    {"preferences", "losses", "population", "variation"},
+    {"preferences", "losses", "population", "styled_population", "styles", "values", "variation"},
     {
         "popl",
         "policy_set",
@@ -67,6 +69,7 @@ LAYERS = (
         "benchmark",
         "benchmark_plots",
         "benchmark_report",
+        "data",
         "jobs",
         "likeness",
         "reward_pictures",
@@ -80,6 +83,7 @@ LAYERS = (
         "report",
         "pictures",
         "runs",
+        "store",
         "trainer",
         "worlds",
     },
