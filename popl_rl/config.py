@@ -128,6 +128,7 @@ class EvaluationConfig:
     baseline_learning_rate: float = 2e-3  # of their Adam
     baseline_alpha: float = 0.5  # scale of their scores
     baseline_conservatism: float = 0.9  # lambda of their CPL loss; 1 for reward functions
+    animate: bool = False  # an animated GIF for each group, where there is a renderer
     history: int = 10  # generations between two snapshots for the pictures; 0 for none
 
 

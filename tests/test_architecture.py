@@ -66,6 +66,7 @@ LAYERS = (
     },
     {
         "acting",
+        "animation",
         "benchmark",
         "benchmark_plots",
         "benchmark_report",
@@ -79,6 +80,9 @@ LAYERS = (
         "findings",
         "results",
         "loggers",
+        "motion_pictures",
+        "motion_plots",
+        "plot_style",
         "plots",
         "report",
         "pictures",
