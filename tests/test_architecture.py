@@ -74,6 +74,8 @@ LAYERS = (
         "utility_plots",
         "experiment",
         "findings",
+        "hindsight",
+        "panel",
         "results",
         "loggers",
         "plots",

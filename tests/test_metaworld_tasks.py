@@ -350,7 +350,7 @@ def test_a_tiny_run(config_of, tmp_path):
         f"run_dir={tmp_path / 'run'}",
     )
     result = run(config)
-    assert set(result.board.results.group) == {"fast", "gentle"}
+    assert set(result.board.results.group) == {"fast", "gentle", "all"}
     returns = result.board.results.query("measure == 'return'")
     assert returns.value.notna().all()
     assert result.policies.population.spec.action_dim == 4
