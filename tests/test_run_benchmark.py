@@ -379,7 +379,7 @@ def test_a_folder_of_another_suite(call, trainer):
 # For real
 
 
-@pytest.mark.parametrize("name", ["smoke", "stateless", "two_doors"])
+@pytest.mark.parametrize("name", ["smoke", "stateless", "sweeps", "two_doors"])
 def test_scenarios_and_methods_of_our_suites_are_configurations(name):
     suite = load_suite(name, folder=files("popl_rl.configs.suites"))
     cells = plan(suite, seeds=1)
