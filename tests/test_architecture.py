@@ -65,6 +65,7 @@ LAYERS = (
     {
         "acting",
         "benchmark",
+        "benchmark_curves",
         "benchmark_plots",
         "benchmark_report",
         "jobs",
