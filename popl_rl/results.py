@@ -1,4 +1,17 @@
-"""The scoreboard of a run: every method, every group, every measure, in tidy rows."""
+"""The scoreboard of a run: every method, every group, every measure, in tidy rows.
+
+For each group: ``return, recovery, success, accuracy, best_accuracy`` of what new raters are given
+after ``evaluation.answers`` answers; ``accuracy@K`` and ``recovery@K`` after K; ``best_recovery``
+of the best of the members rolled out, without the luck of the best; ``accurate_recovery`` of the
+member that ranks the group's held-out pairs best (and both returns).
+
+For the group ``all``: ``worst_recovery`` and ``coverage`` of the groups. For a set also
+``distinct`` and ``effective`` members; how panels of new raters, whose groups nobody looks at, are
+met (``further_accuracy, one_for_all_accuracy, gain, gain_error, favourite_share``, see
+:mod:`popl_rl.panel`); accuracy of the fair choice of one panel for the worst rater of another
+(``fair_worst_rater``) and the 10 % quantile (``fair_quantile``), and its ``fair_recovery`` for the
+group that it serves worst.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -37,7 +50,7 @@ from popl_rl.worlds import World, has_nothing_to_do
 
 __all__ = ["Judge", "Scoreboard", "make_judge"]
 
-_CATERING = ("posterior", "lexicase")
+_CATERING = {"posterior": "", "lexicase": "_lexicase"}  # what it adds to a method's name
 _PANEL = 5  # raters of each of two panels, for each new rater of a group
 _PANEL_ANSWERS = 50
 
@@ -200,11 +213,11 @@ class Judge:
         catered: dict[str, int] = {}
         episodes: dict[tuple[str, str], TensorDict] = {}
         sets = {"popl": hypotheses} | ({} if rivals is None else {"brex": rivals.brex})
+        pooled_scores = None if baselines is None else self.scores(baselines)[0]
         for label, found in sets.items():
             # Curves of what is judged; what it is compared with has too many members for them.
             curve = sorted(set(self.config.curve)) if found is hypotheses else []
             served = self._serve(found, label, rows, curve=curve)
-            pooled_scores = None if baselines is None else self.scores(baselines)[0]
             self._score_as_a_whole(found, label, rows, served, pooled_scores)
             if label == "popl":
                 for index, group in enumerate(self.groups):
@@ -242,7 +255,9 @@ class Judge:
         fair = torch.tensor(found.fair(self.bank, self.panels[0]))
         accurate = accuracy.argmax(0)
         always = [*picks.values(), accurate, fair]
-        members = to_roll(always, points, limit=self.config.curve_members)
+        # A member more costs a training of PPO more, where that is how members act.
+        limit = 0 if isinstance(self.acting, Optimising) else self.config.curve_members
+        members = to_roll(always, points, limit=limit)
         rolled = self.acting(found.subset(members))
         served = _Served(picks, members, rolled, int(fair))
         returns = group_returns(rolled, self.groups)
@@ -251,14 +266,14 @@ class Judge:
         for index in range(len(self.groups)):
             most = float(accuracy[:, index].max())
             for method, chosen in picks.items():
-                name = label if method == "posterior" else f"{label}_lexicase"
+                name = label + _CATERING[method]
                 rows.add(name, index, rolled, served.share(index, chosen))
                 rows.add_accuracy(name, index, float(accuracy[chosen[index], index].mean()), most)
             rows.add_return(label, index, "best_", float(best[index]))
             place = members.index(int(accurate[index]))
             rows.add_return(label, index, "accurate_", float(returns[place, index]))
             for (method, answers), chosen in points.items():
-                name = label if method == "posterior" else f"{label}_lexicase"
+                name = label + _CATERING[method]
                 value = float(accuracy[chosen[index], index].mean())
                 rows.add_value(name, index, f"accuracy@{answers}", value)
                 if set(chosen.flatten().tolist()) <= set(members):
