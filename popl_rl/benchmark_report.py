@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from popl_rl.benchmark import Cell, is_finished, worst
+from popl_rl.benchmark_curves import catering_curves, recovery_along_axes, scenario_dots
 from popl_rl.benchmark_plots import scenario_bars, sweep_panels
 from popl_rl.plot_style import save
 from popl_rl.report import _table, interval
@@ -20,12 +21,20 @@ from popl_rl.suite import Suite
 
 __all__ = ["markdown", "recovery_table", "stands_out", "write_report"]
 
+_FEW = 4  # methods whose bars can be read, and groups with rows of their own on an axis
 Numbers = np.ndarray[Any, np.dtype[np.float64]]
 _WORDS = {
     "recovery": "(return − random) / (oracle's return − random) of the policy that a new rater is "
     "given: 1 is as good as a policy trained with the true groups, 0 as bad as random actions.",
     "±": "half of the 95 % interval of the mean over seeds (Student's t). In brackets: the lowest "
     "seed. Bold: the best, where its interval is apart from those of all other methods.",
+    "coverage": "share of groups with a recovery of at least 0.9.",
+    "best in hindsight": "the lowest recovery if each group was given the best of the members "
+    "that were rolled out; chosen by one half of the episodes and judged by the other.",
+    "gap": "what catering leaves to the best in hindsight, in recovery, of the group with most.",
+    "effective": "number of clearly different members (order 2, similarity-sensitive).",
+    "fair, worst rater (10 %)": "accuracy of the one policy that a panel of new raters makes the "
+    "fair choice, for the worst rater (and the 10 % quantile) of another panel.",
     "accuracy": "share of held-out pairs, in percent, that the policy given to new raters of the "
     "group ranks as the group does; in parentheses, that of the member that suits the group best, "
     "as only hindsight can tell.",
@@ -55,10 +64,15 @@ def write_report(
     folder.mkdir(exist_ok=True)
     # Scenarios on a single axis are told apart in its panel, where bars would be too many.
     alone = [one.name for one in suite.scenarios.values() if len(one.at) != 1]
+    apart = results[results["scenario"].isin(alone)]
     drawings = {
-        "recovery": (scenario_bars, results[results["scenario"].isin(alone)]),
-        "sweeps": (sweep_panels, results),
+        "recovery": (scenario_bars if len(suite.methods) <= _FEW else scenario_dots, apart),
+        "catering": (catering_curves, apart),
+        "axes": (recovery_along_axes, results),
     }
+    ranked = results[results["measure"] == "accuracy"]
+    if ranked.loc[~ranked["scenario"].isin(alone), "group"].nunique() <= _FEW:
+        drawings["sweeps"] = (sweep_panels, results)
     figures = []
     for name, (draw, rows) in drawings.items():
         path = folder / f"{name}.png"
@@ -104,19 +118,25 @@ def markdown(
         figures: Pictures, relative to the folder of the report.
 
     Returns:
-        Markdown: recovery by scenario, accuracy by group, a table for each axis, the pictures,
-        what scenarios and methods are, and what the words mean.
+        Markdown: recovery by method and scenario, what sets hold, accuracy by group, tables for
+        each axis, the pictures, what scenarios and methods are, and what the words mean.
     """
     blocks = [f"# Benchmark: suite {suite.name}"]
     blocks.append(_table(["", ""], [[key, value] for key, value in about.items()]))
     if missing:
         blocks.append(f"## Missing cells: {len(missing)}")
         blocks.append("\n".join(f"- {cell}: {_line(why)}" for cell, why in missing.items()))
+    alone = [one.name for one in suite.scenarios.values() if len(one.at) != 1]
     head, rows = recovery_table(suite, results)
     if rows:
         blocks.append("## How well is the worst-served group served?")
-        blocks.append("Recovery of the group with the lowest, by scenario and method.")
+        blocks.append("Recovery of the group with the lowest, by method and scenario.")
+        head, rows = _turned(head, [row for row in rows if row[0] in alone])
         blocks.append(_table(head, rows, right=len(head) - 1))
+    head, rows = catering_table(suite, results[results["scenario"].isin(alone)])
+    if rows:
+        blocks.append("## How much does the set hold, and how much of it is found?")
+        blocks.append(_table(head, rows, right=len(head) - 2))
     axes = suite.axes()
     swept = {name for points in axes.values() for name in points}
     head, rows = _accuracy_table(suite, results[~results["scenario"].isin(swept)])
@@ -125,11 +145,17 @@ def markdown(
         blocks.append("Accuracy in percent: of what new raters are given (of the best member).")
         blocks.append(_table(head, rows, right=len(head) - 2))
     for axis, points in axes.items():
-        head, rows = _axis_table(suite, results, points)
+        tables = []
+        head, rows = _axis_recoveries(suite, results, points)
         if rows:
-            blocks.append(f"## Axis: {axis}")
-            blocks.append("Accuracy in percent: of what new raters are given (of the best member).")
-            blocks.append(_table(head, rows, right=len(points)))
+            tables.append("Recovery of the worst-served group.")
+            tables.append(_table(head, rows, right=len(points)))
+        head, rows = _axis_table(suite, results, points)
+        if rows and len({group for _, group, *_ in rows}) <= _FEW:
+            tables.append("Accuracy in percent: of what new raters are given (of the best member).")
+            tables.append(_table(head, rows, right=len(points)))
+        if tables:
+            blocks += [f"## Axis: {axis}", *tables]
     blocks += [f"![{path.stem.replace('_', ' ')}]({quote(path.as_posix())})" for path in figures]
     blocks.append("## Scenarios and methods")
     blocks.append("Overrides of `popl-train`, after those of all cells: " + _code(suite.overrides))
@@ -173,6 +199,79 @@ def recovery_table(suite: Suite, results: pd.DataFrame) -> tuple[list[str], list
             cells.append(f"**{text}**" if method == best else text)
         rows.append(cells)
     return ["scenario", *map(suite.label, methods)], rows
+
+
+def catering_table(suite: Suite, results: pd.DataFrame) -> tuple[list[str], list[list[str]]]:
+    """Lay out what each method's set covers, holds, and what catering finds of it.
+
+    Args:
+        suite: The suite.
+        results: Rows as of :func:`popl_rl.benchmark.collect`.
+
+    Returns:
+        Names of the columns, and rows; a row for each scenario and method with a set, with means
+        over seeds and their 95 % intervals.
+    """
+    own = results[results["method"].isin(list(suite.methods))]
+    whole = own[own["group"] == "all"]
+    rows = []
+    for scenario in own["scenario"].unique():
+        for method in suite.methods:
+            chosen = (own["scenario"] == scenario) & (own["method"] == method)
+            of_both = own[chosen & (own["group"] != "all")]
+            best = _by_seed(of_both, "best_recovery")
+            if best.empty:
+                continue
+            numbers = whole[(whole["scenario"] == scenario) & (whole["method"] == method)]
+            coverage, effective, fair, fair_quantile = (
+                numbers.loc[numbers["measure"] == name, "value"].dropna().to_numpy(dtype=float)
+                for name in ("coverage", "effective", "fair_worst_rater", "fair_quantile")
+            )
+            gaps = [
+                (best - _by_seed(of_both, measure)).groupby("seed").max().dropna().to_numpy()
+                for measure in ("recovery", "recovery@10")
+            ]
+            cells = [coverage, best.groupby("seed").min().to_numpy(), *gaps, effective]
+            last = f"{_mean(fair)} ({_mean(fair_quantile)})"
+            rows.append([str(scenario), suite.label(method), *map(_mean, cells), last])
+    head = ["scenario", "method", "coverage", "best in hindsight", "gap", "gap at 10 answers"]
+    return [*head, "effective", "fair, worst rater (10 %)"], rows
+
+
+def _by_seed(rows: pd.DataFrame, measure: str) -> pd.Series:
+    """A measure by seed and group."""
+    values: pd.Series = rows[rows["measure"] == measure].set_index(["seed", "group"])["value"]
+    return values.dropna()
+
+
+def _mean(values: Numbers) -> str:
+    if not len(values):
+        return "–"
+    mean, half = interval(values)
+    text = f"{mean:z.2f}" + ("" if math.isnan(half) else f" ± {half:.2f}")
+    return text.replace("-", "−")
+
+
+def _turned(head: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
+    """Make rows of columns: there are more methods than scenarios. Empty ones are left out."""
+    turned = [list(row) for row in zip(head, *rows, strict=True)]
+    (_, *scenarios), *methods = turned
+    return ["method", *scenarios], [row for row in methods if set(row[1:]) != {"–"}]
+
+
+def _axis_recoveries(
+    suite: Suite, results: pd.DataFrame, points: Mapping[str, float | str]
+) -> tuple[list[str], list[list[str]]]:
+    """A row for each method that has recoveries along an axis, a column for each point."""
+    head, rows = recovery_table(suite, results[results["scenario"].isin(list(points))])
+    if not rows:
+        return head, []
+    by_scenario = {row[0]: row for row in rows}
+    empty = ["–"] * len(head)
+    ordered = [[name, *by_scenario.get(name, empty)[1:]] for name in points]
+    _, turned = _turned(head, ordered)
+    along = [row for row in turned if sum(cell != "–" for cell in row[1:]) > 1]
+    return ["method", *map(str, points.values())], along
 
 
 def stands_out(intervals: Mapping[str, tuple[float, float]]) -> str | None:

@@ -111,6 +111,9 @@ class EvaluationConfig:
     episodes: int = 200  # episodes per policy
     new_raters: int = 20  # new raters of each group that the set is catered to
     answers: int = 20  # answers of each of them
+    # Numbers of answers that catering is measured at besides, on the same new raters; [] for none.
+    curve: list[int] = field(default_factory=lambda: [1, 2, 5, 10, 20, 50])
+    curve_members: int = 40  # members that are rolled out for these curves at most
     pairs: int = 4000  # fresh pairs per group for accuracies
     menu: int = 10  # items that a reward function chooses from, where there is nothing to do
     optimiser: str = "auto"  # how reward functions act: plan, ppo; auto: plan if there is a table
@@ -204,6 +207,9 @@ def validate(config: Config) -> None:
     at_least_one(raters, "raters", "count", "answers")
     at_least_one(data, "data", "segments", "length")
     at_least_one(evaluation, "evaluation", "episodes", "new_raters", "answers", "pairs")
+    at_least_one(evaluation, "evaluation", "curve_members")
+    positive = all(answers >= 1 for answers in evaluation.curve)
+    expect(positive, "evaluation.curve", "numbers of at least 1", list(evaluation.curve))
     at_least_one(evaluation, "evaluation", "baseline_steps", "baseline_batch_size")
     at_least_one(method, "method", "generations", "steps", "batch_size")
     at_least_one(method, "method", "teams", "team_generations", "pooled_steps")

@@ -1,5 +1,6 @@
 """What a reader of a report should not have to find out alone."""
 
+import pandas as pd
 import torch
 
 from popl_rl.acting import Choosing
@@ -7,7 +8,7 @@ from popl_rl.keys import OBSERVATION
 from popl_rl.majority import find_cycle, majority
 from popl_rl.results import Judge, Scoreboard
 
-__all__ = ["findings"]
+__all__ = ["alarm", "findings"]
 
 _ITEMS = 150  # of which three are looked for that a majority prefers in a circle
 
@@ -20,11 +21,21 @@ def findings(board: Scoreboard, judge: Judge) -> dict[str, str]:
         judge: With the groups and what things are worth to them.
 
     Returns:
-        Sentences by what they are about: ``collapse``, if groups were given the same hypothesis;
+        Sentences by what they are about: ``new raters' further answers``, how well they are met;
+        ``alarm``, see :func:`alarm`; ``collapse``, if groups were given the same hypothesis;
         ``hidden context``, DPL's detector, if it ran; ``majority``, if the groups, pooled in equal
         shares, prefer states in a circle, so that no single utility can say what they want.
     """
     said = {}
+    row = _row_of(board.results)
+    if row is not None:
+        said["new raters' further answers"] = (
+            f"{row['further_accuracy']:.1%} ranked right by what their first answers choose, "
+            f"{row['one_for_all_accuracy']:.1%} by one hypothesis for all"
+        )
+    warning = alarm(board.results)
+    if warning is not None:
+        said["alarm"] = warning
     shared: dict[int, list[str]] = {}
     for name, member in board.catered.items():
         shared.setdefault(member, []).append(name)
@@ -43,6 +54,39 @@ def findings(board: Scoreboard, judge: Judge) -> dict[str, str]:
     if circle is not None:
         said["majority"] = circle
     return said
+
+
+def alarm(results: pd.DataFrame) -> str | None:
+    """Say so if a set serves people no better than one hypothesis for all would.
+
+    It looks at answers of new raters and at no groups, so that it would do the same for people.
+
+    Args:
+        results: Rows of a scoreboard.
+
+    Returns:
+        A sentence, or None if catering meets further answers better by more than two standard
+        errors.
+    """
+    row = _row_of(results)
+    if row is None or row["gain"] > 2 * row["gain_error"]:
+        return None
+    return (
+        "the set meets new raters no better than one hypothesis for all does "
+        f"({100 * row['gain']:+.1f} ± {200 * row['gain_error']:.1f} points; "
+        f"{row['favourite_share']:.0%} of raters have the same favourite; effectively "
+        f"{row['effective']:.1f} members): it tells nobody apart, unless everybody wants the same"
+    )
+
+
+def _row_of(results: pd.DataFrame) -> pd.Series | None:
+    """What was measured about the set as a whole, by measure."""
+    judged = results.method[results.measure == "gain"]
+    if judged.empty:
+        return None
+    chosen = (results.method == judged.iloc[0]) & (results.group == "all")
+    row: pd.Series = results[chosen].set_index("measure")["value"]
+    return row
 
 
 def _circle(judge: Judge) -> str | None:

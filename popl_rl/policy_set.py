@@ -22,7 +22,17 @@ from popl_rl.population import Population
 from popl_rl.rewards import RewardSpec, reward_bank
 from popl_rl.segments import SegmentBank, load_tensordict, save_tensordict
 
-__all__ = ["Catered", "HypothesisSet", "PolicySet", "RewardSet", "as_set", "load_set"]
+__all__ = [
+    "Catered",
+    "HypothesisSet",
+    "PolicySet",
+    "RewardSet",
+    "answer_log_likelihood",
+    "as_set",
+    "load_set",
+]
+
+_MISTAKE = 0.05
 
 
 @dataclass(frozen=True)
@@ -111,7 +121,7 @@ class HypothesisSet:
         answers: TensorDictBase,
         *,
         method: Literal["posterior", "lexicase"] = "posterior",
-        mistake: float = 0.05,
+        mistake: float = _MISTAKE,
         generator: torch.Generator | None = None,
     ) -> Catered:
         """Choose a hypothesis for one rater from a few answers.
@@ -134,8 +144,7 @@ class HypothesisSet:
         if method == "posterior":
             if not 0 <= mistake < 0.5:
                 raise ValueError(f"mistake must be in [0, 0.5), got {mistake}")
-            probability = (1 - mistake) * margin.sigmoid() + mistake * (-margin).sigmoid()
-            log_weight = probability.clamp(min=1e-12).log().sum(1)
+            log_weight = answer_log_likelihood(margin, mistake=mistake).sum(1)
             return Catered(int(log_weight.argmax()), log_weight.softmax(0))
         if method == "lexicase":
             if generator is None:
@@ -362,6 +371,17 @@ class RewardSet(HypothesisSet):
         """
         rewards: Tensor = self.population(observation)
         return rewards
+
+
+def answer_log_likelihood(margin: Tensor, *, mistake: float = _MISTAKE) -> Tensor:
+    """Log-likelihood of strict answers in each hypothesis's eyes.
+
+    Args:
+        margin: Margins of what was preferred over what was not, of any shape.
+        mistake: Chance of a slip, which keeps single answers from ruling a hypothesis out.
+    """
+    probability = (1 - mistake) * margin.sigmoid() + mistake * (-margin).sigmoid()
+    return probability.clamp(min=1e-12).log()
 
 
 def as_set(population: Population, *, alpha: float, discount: float = 1.0) -> HypothesisSet:

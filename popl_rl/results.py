@@ -1,7 +1,21 @@
-"""The scoreboard of a run: every method, every group, every measure, in tidy rows."""
+"""The scoreboard of a run: every method, every group, every measure, in tidy rows.
+
+For each group: ``return, recovery, success, accuracy, best_accuracy`` of what new raters are given
+after ``evaluation.answers`` answers; ``accuracy@K`` and ``recovery@K`` after K; ``best_recovery``
+of the best of the members rolled out, without the luck of the best; ``accurate_recovery`` of the
+member that ranks the group's held-out pairs best (and both returns).
+
+For the group ``all``: ``worst_recovery`` and ``coverage`` of the groups. For a set also
+``distinct`` and ``effective`` members; how panels of new raters, whose groups nobody looks at, are
+met (``further_accuracy, one_for_all_accuracy, gain, gain_error, favourite_share``, see
+:mod:`popl_rl.panel`); accuracy of the fair choice of one panel for the worst rater of another
+(``fair_worst_rater``) and the 10 % quantile (``fair_quantile``), and its ``fair_recovery`` for the
+group that it serves worst.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import pandas as pd
 import torch
@@ -9,6 +23,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from popl_rl.acting import Acting, Choosing, Optimising, Planning, Rolling
+from popl_rl.comparisons import Comparisons
 from popl_rl.config import Config, EnvConfig, EvaluationConfig
 from popl_rl.evaluation import (
     group_accuracy,
@@ -22,8 +37,12 @@ from popl_rl.evaluation import (
     success_rate,
 )
 from popl_rl.experiment import Data, build_bank, fresh_segments, stream
+from popl_rl.hindsight import best_in_hindsight, coverage, lowest, to_roll
+from popl_rl.keys import RATER
+from popl_rl.panel import draw_panel, favourites, gain
 from popl_rl.policies import PolicySpec
 from popl_rl.policy_set import HypothesisSet, PolicySet
+from popl_rl.popl import case_values
 from popl_rl.population import segment_scores
 from popl_rl.preferences import starts_of
 from popl_rl.raters import RaterGroup
@@ -33,6 +52,10 @@ from popl_rl.segments import SegmentBank
 from popl_rl.worlds import World, has_nothing_to_do
 
 __all__ = ["Judge", "Scoreboard", "make_judge"]
+
+_CATERING = {"posterior": "", "lexicase": "_lexicase"}  # what it adds to a method's name
+_PANEL = 5  # raters of each of two panels, for each new rater of a group
+_PANEL_ANSWERS = 50
 
 
 @dataclass(frozen=True)
@@ -68,6 +91,7 @@ class Judge:
         worth: Worth of each segment to each group, ``[G, N]``.
         start: Which segments may be compared, ``[N]``; all if None.
         reference: A policy whose return is a recovery of 0; random actions if None.
+        shares: Chance that a rater is of each group; equal if None.
         seed: Seed of the run.
     """
 
@@ -82,12 +106,13 @@ class Judge:
         *,
         start: Tensor | None = None,
         reference: HypothesisSet | None = None,
+        shares: Sequence[float] | None = None,
         seed: int,
     ) -> None:
         self.acting, self.env, self.config = acting, env, config
         self.groups, self.bank, self.worth = groups, bank, worth
         self.start, self.reference = start, reference
-        self.seed = seed
+        self.shares, self.seed = shares, seed
         generator = stream(seed, "held-out pairs")
         self.pairs = {
             index: held_out_pairs(
@@ -96,12 +121,15 @@ class Judge:
             for index in range(len(groups))
         }
 
+    def scores(self, hypotheses: HypothesisSet) -> Tensor:
+        """Score of every segment in every hypothesis's eyes, ``[P, N]``."""
+        return segment_scores(
+            hypotheses.population, self.bank, alpha=hypotheses.alpha, discount=hypotheses.discount
+        ).cpu()
+
     def accuracy(self, hypotheses: HypothesisSet) -> Tensor:
         """Accuracy of every hypothesis on every group's held-out pairs, ``[P, G]``."""
-        scores = segment_scores(
-            hypotheses.population, self.bank, alpha=hypotheses.alpha, discount=hypotheses.discount
-        )
-        return group_accuracy(scores.cpu(), self.pairs)
+        return group_accuracy(self.scores(hypotheses), self.pairs)
 
     def snapshot(self, hypotheses: HypothesisSet) -> dict[str, float]:
         """Accuracy of every hypothesis on every group, flat: ``{"<group>/<member>": value}``."""
@@ -112,30 +140,72 @@ class Judge:
             for member, value in enumerate(column)
         }
 
-    def cater(self, hypotheses: HypothesisSet, method: str) -> Tensor:
-        """Member given to each of several new raters of each group, ``[G, raters]``."""
-        picks = []
+    @cached_property
+    def new_raters(self) -> list[list[TensorDict]]:
+        """What several new raters of each group answer: the same whatever is being judged.
+
+        Each answers as often as any point of a curve needs; fewer answers are the first of these.
+        """
+        answers = max([self.config.answers, *self.config.curve])
+        said = []
         for index in range(len(self.groups)):
-            # The same new raters, pairs and answers whatever is being judged.
             generator = stream(self.seed, f"new raters/{index}")
-            draw = stream(self.seed, f"lexicase catering/{index}")
-            for _ in range(self.config.new_raters):
-                answers = new_rater_answers(
-                    self.groups,
-                    index,
-                    self.worth,
-                    answers=self.config.answers,
-                    start=self.start,
-                    generator=generator,
-                )
+            said.append(
+                [
+                    new_rater_answers(
+                        self.groups,
+                        index,
+                        self.worth,
+                        answers=answers,
+                        start=self.start,
+                        generator=generator,
+                    )
+                    for _ in range(self.config.new_raters)
+                ]
+            )
+        return said
+
+    def cater(
+        self, hypotheses: HypothesisSet, method: str, *, answers: int | None = None
+    ) -> Tensor:
+        """Member given to each of several new raters of each group, ``[G, raters]``.
+
+        Args:
+            hypotheses: What is chosen from.
+            method: How, see :meth:`~popl_rl.policy_set.HypothesisSet.cater`.
+            answers: Answers that are known of each; as configured if None.
+        """
+        known = self.config.answers if answers is None else answers
+        picks = []
+        for index, raters in enumerate(self.new_raters):
+            draw = stream(self.seed, f"lexicase catering/{index}/{known}")
+            for said in raters:
                 choice = hypotheses.cater(
                     self.bank,
-                    answers,
+                    said[:known],
                     method=method,  # type: ignore[arg-type]
                     generator=draw,
                 )
                 picks.append(choice.member)
         return torch.tensor(picks).view(len(self.groups), -1)
+
+    @cached_property
+    def panels(self) -> tuple[TensorDict, TensorDict]:
+        """Answers of two panels of new raters in the groups' shares, of unknown groups."""
+        generator = stream(self.seed, "panels")
+        one, other = (
+            draw_panel(
+                self.groups,
+                self.worth,
+                raters=_PANEL * self.config.new_raters,
+                answers=_PANEL_ANSWERS,
+                shares=self.shares,
+                start=self.start,
+                generator=generator,
+            )
+            for _ in range(2)
+        )
+        return one, other
 
     def score(
         self,
@@ -160,22 +230,17 @@ class Judge:
         catered: dict[str, int] = {}
         episodes: dict[tuple[str, str], TensorDict] = {}
         sets = {"popl": hypotheses} | ({} if rivals is None else {"brex": rivals.brex})
+        pooled_scores = None if baselines is None else self.scores(baselines)[0]
         for label, found in sets.items():
-            accuracy = self.accuracy(found)
-            for method in ("posterior", "lexicase"):
-                name = label if method == "posterior" else f"{label}_lexicase"
-                picks = self.cater(found, method)
-                used, position = picks.unique(return_inverse=True)
-                rolled = self.acting(found.subset(used.tolist()))
+            # Curves of what is judged; what it is compared with has too many members for them.
+            curve = sorted(set(self.config.curve)) if found is hypotheses else []
+            served = self._serve(found, label, rows, curve=curve)
+            self._score_as_a_whole(found, label, rows, served, pooled_scores)
+            if label == "popl":
                 for index, group in enumerate(self.groups):
-                    share = position[index].bincount(minlength=len(used)).float()
-                    mean = float(accuracy[picks[index], index].mean())
-                    rows.add(name, index, rolled, share / share.sum())
-                    rows.add_accuracy(name, index, mean, float(accuracy[:, index].max()))
-                    if name == "popl":
-                        favourite = int(share.argmax())
-                        catered[group.name] = int(used[favourite])
-                        episodes[name, group.name] = rolled[favourite : favourite + 1]
+                    place = int(served.share(index, served.picks["posterior"]).argmax())
+                    catered[group.name] = served.members[place]
+                    episodes[label, group.name] = served.rolled[place : place + 1]
         if baselines is not None and base is not None:
             accuracy, one = self.accuracy(baselines), torch.ones(1)
             pooled = "cpl" if isinstance(baselines, PolicySet) else "bradley_terry"
@@ -191,8 +256,87 @@ class Judge:
             if self.reference is not None:
                 rows.add("clone", index, reference, torch.ones(1))
             rows.add("random", index, random, torch.ones(1))
+        rows.add_worst()
         results = pd.DataFrame(rows.rows, columns=["method", "group", "measure", "value"])
         return Scoreboard(results, catered, episodes)
+
+    def _serve(
+        self, found: HypothesisSet, label: str, rows: "_Rows", *, curve: Sequence[int]
+    ) -> "_Served":
+        """What new raters are given, and what it is worth to them beside the best there is."""
+        accuracy = self.accuracy(found)
+        picks = {method: self.cater(found, method) for method in _CATERING}
+        points = {
+            (method, answers): self.cater(found, method, answers=answers)
+            for answers in curve
+            for method in _CATERING
+        }
+        fair = torch.tensor(found.fair(self.bank, self.panels[0]))
+        accurate = accuracy.argmax(0)
+        always = [*picks.values(), accurate, fair]
+        # A member more costs a training of PPO more, where that is how members act.
+        limit = 0 if isinstance(self.acting, Optimising) else self.config.curve_members
+        members = to_roll(always, points, limit=limit)
+        rolled = self.acting(found.subset(members))
+        served = _Served(picks, members, rolled, int(fair))
+        returns = group_returns(rolled, self.groups)
+        halves = rolled[:, ::2], rolled[:, 1::2] if rolled.shape[1] > 1 else rolled
+        best = best_in_hindsight(*(group_returns(half, self.groups) for half in halves))
+        for index in range(len(self.groups)):
+            most = float(accuracy[:, index].max())
+            for method, chosen in picks.items():
+                name = label + _CATERING[method]
+                rows.add(name, index, rolled, served.share(index, chosen))
+                rows.add_accuracy(name, index, float(accuracy[chosen[index], index].mean()), most)
+            rows.add_return(label, index, "best_", float(best[index]))
+            place = members.index(int(accurate[index]))
+            rows.add_return(label, index, "accurate_", float(returns[place, index]))
+            for (method, answers), chosen in points.items():
+                name = label + _CATERING[method]
+                value = float(accuracy[chosen[index], index].mean())
+                rows.add_value(name, index, f"accuracy@{answers}", value)
+                if set(chosen.flatten().tolist()) <= set(members):
+                    value = float(returns[:, index] @ served.share(index, chosen))
+                    value = rows.recovery(index, value)
+                    rows.add_value(name, index, f"recovery@{answers}", value)
+        return served
+
+    def _score_as_a_whole(
+        self,
+        found: HypothesisSet,
+        label: str,
+        rows: "_Rows",
+        served: "_Served",
+        pooled: Tensor | None,
+    ) -> None:
+        """What a set is worth to raters whose group nobody knows: rows of the group ``all``."""
+        choosing, measuring = self.panels
+        other = measuring.clone()
+        other[RATER] = other[RATER] + _PANEL * self.config.new_raters
+        everybody = Comparisons.from_preferences(torch.cat([choosing, other]), cases="rater")
+        judging = Comparisons.from_preferences(measuring, cases="rater")
+        scores = self.scores(found)
+        margin = scores[:, everybody.preferred] - scores[:, everybody.other]
+        alone = None if pooled is None else pooled[everybody.preferred] - pooled[everybody.other]
+        met = gain(margin, alone, everybody)
+        favourite = favourites(margin, everybody)
+        fair = scores[served.fair].unsqueeze(0)
+        fair = case_values(fair[:, judging.preferred] > fair[:, judging.other], judging)[0]
+        place = served.members.index(served.fair)
+        returns = group_returns(served.rolled[place : place + 1], self.groups)[0].tolist()
+        recoveries = [rows.recovery(index, value) for index, value in enumerate(returns)]
+        rows.rows += [
+            (label, "all", "distinct", float(len((margin > 0).unique(dim=0)))),
+            (label, "all", "effective", found.effective_number(self.bank, everybody)),
+            (label, "all", "favourite_share", float(favourite.bincount().max() / len(favourite))),
+            (label, "all", "further_accuracy", met.catered),
+            (label, "all", "one_for_all_accuracy", met.alone),
+            (label, "all", "gain", met.catered - met.alone),
+            (label, "all", "gain_error", met.error),
+            (label, "all", "fair_worst_rater", float(fair.min())),
+            (label, "all", "fair_quantile", float(fair.quantile(0.1))),
+            (label, "all", "fair_recovery", lowest(recoveries)),
+        ]
 
     def _score_distributional(self, rivals: Rivals, rows: "_Rows") -> None:
         assert isinstance(self.acting, Choosing)
@@ -205,6 +349,28 @@ class Judge:
         for kind, model in rivals.dpl.items():
             context = model.hidden_context(self.bank)
             rows.rows.append((f"dpl_{kind}", "all", "hidden_context", context))
+
+
+@dataclass(frozen=True)
+class _Served:
+    """Members that were rolled out, and who was given which.
+
+    Attributes:
+        picks: Member of each new rater ``[G, raters]``, by kind of catering.
+        members: Members that were rolled out.
+        rolled: Their episodes, ``[len(members), E, H]``.
+        fair: The fair choice.
+    """
+
+    picks: dict[str, Tensor]
+    members: list[int]
+    rolled: TensorDict
+    fair: int
+
+    def share(self, index: int, picks: Tensor) -> Tensor:
+        """Share of a group's new raters that are given each of the members rolled out."""
+        given = (picks[index].unsqueeze(1) == torch.tensor(self.members)).float()
+        return given.mean(0)
 
 
 class _Rows:
@@ -227,9 +393,7 @@ class _Rows:
         """What a method does for one group: policies ``[P, E, H]``, weighted by ``share``."""
         group = self.groups[index].name
         value = float(group_returns(rolled, self.groups)[:, index] @ share)
-        low, high = float(self.reference[index]), float(self.oracle[index])
-        self.rows.append((method, group, "return", value))
-        self.rows.append((method, group, "recovery", recovery(value, reference=low, oracle=high)))
+        self.add_return(method, index, "", value)
         success = float(success_rate(rolled, self.env.success) @ share)
         self.rows.append((method, group, "success", success))
         if self.env.measured:
@@ -243,6 +407,30 @@ class _Rows:
                 if door >= 0:
                     name = f"{self.env.door}_{door}"
                     self.rows.append((method, group, name, float(rate @ share)))
+
+    def recovery(self, index: int, value: float) -> float:
+        """What a return to a group is between the reference and the group's oracle."""
+        low, high = float(self.reference[index]), float(self.oracle[index])
+        return recovery(value, reference=low, oracle=high)
+
+    def add_return(self, method: str, index: int, prefix: str, value: float) -> None:
+        """A return to one group, and the recovery that this is."""
+        self.add_value(method, index, f"{prefix}return", value)
+        self.add_value(method, index, f"{prefix}recovery", self.recovery(index, value))
+
+    def add_value(self, method: str, index: int, measure: str, value: float) -> None:
+        """Any number about a method and a group."""
+        self.rows.append((method, self.groups[index].name, measure, value))
+
+    def add_worst(self) -> None:
+        """What each method's recoveries of all groups come to."""
+        found: dict[str, list[float]] = {}
+        for method, _, measure, value in self.rows:
+            if measure == "recovery":
+                found.setdefault(method, []).append(value)
+        for method, values in found.items():
+            self.rows.append((method, "all", "worst_recovery", lowest(values)))
+            self.rows.append((method, "all", "coverage", coverage(values)))
 
     def add_accuracy(self, method: str, index: int, catered: float, best: float) -> None:
         """How well a method ranks for one group."""
@@ -284,7 +472,16 @@ def make_judge(
         bank = build_bank(segments, spec).to(device)
         worth = torch.stack([group.worth(segments) for group in groups])
         chooser = Choosing(segments, bank, options, seed=seed)
-        return Judge(chooser, config.env, options, groups, bank, worth, seed=seed)
+        return Judge(
+            chooser,
+            config.env,
+            options,
+            groups,
+            bank,
+            worth,
+            shares=config.raters.shares,
+            seed=seed,
+        )
     bank = build_bank(data.steps, spec).to(device)
     acting: Acting = Rolling(world, config.env, options, seed=seed)
     if isinstance(spec, RewardSpec):
@@ -302,5 +499,6 @@ def make_judge(
         data.worth,
         start=starts_of(data.steps),
         reference=reference,
+        shares=config.raters.shares,
         seed=seed,
     )

@@ -28,6 +28,7 @@ TINY = [
     "raters.answers=10",
     "evaluation.episodes=40",
     "evaluation.new_raters=2",
+    "evaluation.curve=[1,5]",
     "evaluation.pairs=200",
     "evaluation.baseline_steps=100",
     "evaluation.baseline_batch_size=64",

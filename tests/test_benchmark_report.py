@@ -5,7 +5,13 @@ import pandas as pd
 import pytest
 
 from popl_rl.benchmark import COLUMNS, plan
-from popl_rl.benchmark_report import markdown, recovery_table, stands_out, write_report
+from popl_rl.benchmark_report import (
+    catering_table,
+    markdown,
+    recovery_table,
+    stands_out,
+    write_report,
+)
 from popl_rl.suite import parse_suite
 
 SUITE = parse_suite(
@@ -127,6 +133,72 @@ def test_accuracies_by_scenario_and_along_each_axis():
     assert "those of all cells: `env.max_steps=9`" in text
     assert "Missing cells" not in text
     assert "worst-served" not in text, "no recovery is known"
+
+
+def test_the_report_has_a_row_for_each_method_and_a_column_for_each_scenario_off_the_axes():
+    """Two seeds 0.02 apart: half-width 12.706 * 0.01 (t, one degree) = 0.13."""
+    results = table(
+        recoveries("plain", "popl", [0.90, 0.92]),
+        recoveries("plain", "cpl", [0.1, 0.1]),
+        recoveries("base", "popl", [0.9]),
+        recoveries("noisy", "popl", [0.8]),
+        recoveries("noisy", "other", [0.7]),
+    )
+    rows = lines(markdown(SUITE, results, about={}, missing={}, figures=[]))
+    start = rows.index("| method | plain |")
+    assert rows[start + 1 : start + 3] == [
+        "| popl | **0.91 ± 0.13 [0.90]** |",
+        "| CPL on everybody's answers | 0.10 ± 0.00 [0.10] |",
+    ]
+    start = rows.index("| method | 0 | 0.1 |")
+    assert rows[start + 1] == "| popl | 0.90 | 0.80 |"
+    assert not rows[start + 2].startswith("| other"), "only at one point"
+
+
+def test_what_a_set_holds_and_how_much_of_it_is_found():
+    """Seed 0: gaps of 1.0 - 0.9 and 0.8 - 0.75, at 10 answers 0.3 and 0.05. Seed 1: 0 and 0.2, and
+    0.1 and 0.1. The largest are 0.1 and 0.2; 0.3 and 0.1. The best in hindsight of the worst group:
+    0.8 and 0.9."""
+    results = table(
+        ("plain", "popl", "upper", "recovery", [0.9, 1.0]),
+        ("plain", "popl", "upper", "recovery@10", [0.7, 0.9]),
+        ("plain", "popl", "upper", "best_recovery", [1.0, 1.0]),
+        ("plain", "popl", "lower", "recovery", [0.75, 0.7]),
+        ("plain", "popl", "lower", "recovery@10", [0.75, 0.8]),
+        ("plain", "popl", "lower", "best_recovery", [0.8, 0.9]),
+        ("plain", "popl", "all", "coverage", [1.0, 1.0]),
+        ("plain", "popl", "all", "effective", [2.0, 2.0]),
+        ("plain", "popl", "all", "fair_worst_rater", [0.2, 0.2]),
+        ("plain", "popl", "all", "fair_quantile", [0.4, 0.4]),
+        ("plain", "cpl", "upper", "recovery", [0.1, 0.1]),
+        ("plain", "other", "upper", "best_recovery", [0.5]),
+    )
+    head, rows = catering_table(SUITE, results)
+    assert len(head) == len(rows[0])
+    # Half-widths are 12.706 times half the distance.
+    assert rows == [
+        [
+            *("plain", "popl", "1.00 ± 0.00", "0.85 ± 0.64", "0.15 ± 0.64", "0.20 ± 1.27"),
+            *("2.00 ± 0.00", "0.20 ± 0.00 (0.40 ± 0.00)"),
+        ],
+        ["plain", "other", "–", "0.50", "–", "–", "–", "– (–)"],
+    ]
+
+
+def test_axes_of_many_groups_are_told_by_recovery_alone(tmp_path):
+    names = [f"group_{number}" for number in range(5)]
+    rows = [
+        (scenario, "popl", name, measure, [0.5])
+        for scenario in ("base", "noisy")
+        for name in names
+        for measure in ("accuracy", "recovery")
+    ]
+    cells = plan(SUITE, seeds=1)
+    write_report(tmp_path, SUITE, cells, table(*rows), {})
+    assert [path.name for path in (tmp_path / "figures").iterdir()] == ["axes.png"]
+    text = (tmp_path / "report.md").read_text()
+    assert "| popl | 0.50 | 0.50 |" in text
+    assert "| popl | group_0 |" not in text
 
 
 def test_what_is_missing_is_said_on_a_line_each():

@@ -63,6 +63,7 @@ CASES = [
         "evaluation__new_raters",
         "evaluation__answers",
         "evaluation__pairs",
+        "evaluation__curve_members",
         "evaluation__baseline_steps",
         "evaluation__baseline_batch_size",
         "method__generations",
@@ -115,6 +116,7 @@ CASES = [
     ("method__warm_up", -1, "method.warm_up must be at least 0, got -1"),
     ("method__learning_rate", 0.0, "method.learning_rate must be positive, got 0.0"),
     ("method__mutation_std", -0.1, "method.mutation_std must be positive, got -0.1"),
+    ("evaluation__curve", [5, 0], "evaluation.curve must be numbers of at least 1, got [5, 0]"),
     ("evaluation__history", -1, "evaluation.history must be at least 0, got -1"),
     ("logger__name", "paper", "logger.name must be wandb or csv, got 'paper'"),
 ]  # fmt: skip

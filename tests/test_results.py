@@ -6,9 +6,11 @@ from torch import nn
 
 from popl_rl.acting import Rolling
 from popl_rl.config import EnvConfig, EvaluationConfig, RatersConfig
+from popl_rl.evaluation import group_returns
 from popl_rl.experiment import build_groups
+from popl_rl.findings import alarm
 from popl_rl.policies import PolicySpec
-from popl_rl.policy_set import PolicySet
+from popl_rl.policy_set import Catered, PolicySet
 from popl_rl.population import Population
 from popl_rl.results import Judge
 from popl_rl.worlds import build_world
@@ -41,7 +43,7 @@ def judge(segments, bank):
     names = ["popl_rl.testing:likes_left", "popl_rl.testing:likes_right"]
     groups = build_groups(RatersConfig(groups=names, label="regret"), world)
     worth = torch.stack([group.worth(segments) for group in groups])
-    config = EvaluationConfig(episodes=6, new_raters=4, answers=10, pairs=200)
+    config = EvaluationConfig(episodes=6, new_raters=4, answers=10, curve=[], pairs=200)
     acting = Rolling(world, ENV, config, seed=0)
     return Judge(acting, ENV, config, groups, bank, worth, seed=0)
 
@@ -163,3 +165,151 @@ def test_a_snapshot_is_the_accuracy_by_name(judge, policies):
         for policy in range(3)
     }
     assert snapshot["likes_left/2"] > 0.75 > snapshot["likes_left/0"]
+
+
+@pytest.fixture
+def curious(judge):
+    """A judge who measures curves, of policies that always do the same."""
+    config = EvaluationConfig(
+        episodes=6, new_raters=4, answers=10, curve=[10, 1, 25], pairs=200, greedy=True
+    )
+    acting = Rolling(judge.acting.world, ENV, config, seed=0)
+    return Judge(acting, ENV, config, judge.groups, judge.bank, judge.worth, seed=0)
+
+
+def values(board, method, group):
+    rows = board.results[(board.results.method == method) & (board.results.group == group)]
+    return rows.set_index("measure").value.to_dict()
+
+
+def test_fewer_answers_are_the_first_of_more(curious):
+    for raters in curious.new_raters:
+        assert [len(said) for said in raters] == [25] * 4
+    asked = []
+
+    class Spy:
+        def cater(self, _, answers, **__):
+            asked.append(answers["pair"].tolist())
+            return Catered(0, torch.ones(1))
+
+    for answers in (1, 10, None):
+        curious.cater(Spy(), "posterior", answers=answers)
+    one, ten, as_configured = asked[:8], asked[8:16], asked[16:]
+    assert ten == as_configured
+    assert one == [pairs[:1] for pairs in ten]
+    assert ten == [said["pair"][:10].tolist() for raters in curious.new_raters for said in raters]
+
+
+def test_curves_by_hand(curious, policies, baselines):
+    """What is given to whom after one answer decides about both numbers at that point."""
+    board = curious.score(policies, baselines)
+    accuracy = curious.accuracy(policies)
+    returns = group_returns(curious.acting(policies), curious.groups)
+    low = group_returns(curious.acting(None), curious.groups)[0]
+    high = group_returns(curious.acting(baselines)[1:], curious.groups).diagonal()
+    for method in ("posterior", "lexicase"):
+        name = "popl" if method == "posterior" else "popl_lexicase"
+        picks = curious.cater(policies, method, answers=1)
+        for index, group in enumerate(curious.groups):
+            found = values(board, name, group.name)
+            expected = float(accuracy[picks[index], index].mean())
+            assert found["accuracy@1"] == pytest.approx(expected)
+            mean = float(returns[picks[index], index].mean())
+            expected = (mean - float(low[index])) / float(high[index] - low[index])
+            assert found["recovery@1"] == pytest.approx(expected, abs=1e-5)
+            # The headline is a point of the curve.
+            assert found["accuracy@10"] == found["accuracy"]
+            assert found["recovery@10"] == found["recovery"]
+            assert {"accuracy@25", "recovery@25"} <= set(found)
+            assert "accuracy@20" not in found
+
+
+def test_members_are_rolled_once_and_no_more_than_allowed(curious, baselines, monkeypatch):
+    """Members 0 and 2 are the most accurate. Point 25 needs member 3 besides, point 1 member 4."""
+    policies = walkers(4.0, 0.0, -4.0, 3.0, -3.0)
+    given = {None: 0, 10: 0, 25: 3, 1: 4}
+    monkeypatch.setattr(
+        curious, "cater", lambda *_, answers=None: torch.full((2, 4), given[answers])
+    )
+    fair = policies.fair(curious.bank, curious.panels[0])
+    always = len({0, 2, fair})
+    rolled, acting = [], curious.acting
+
+    def watch(hypotheses):
+        rolled.append(0 if hypotheses is None else len(hypotheses))
+        return acting(hypotheses)
+
+    monkeypatch.setattr(curious, "acting", watch)
+    curious.config.curve_members = always + 1
+    board = curious.score(policies, baselines)
+    assert rolled == [0, 3, always + 1], "random actions, baselines, and the set, each in one go"
+    found = values(board, "popl", "likes_left")
+    assert {"recovery@10", "recovery@25"} <= set(found)
+    assert "recovery@1" not in found
+    assert "accuracy@1" in found, "which takes no rollouts"
+
+
+def test_what_hindsight_could_have_given(judge, baselines):
+    """Of a walker for each group and one that does anything, the walker is the best and the most
+    accurate; of two that walk right, both are bad for who likes left."""
+    board = judge.score(walkers(4.0, 0.0, -4.0), baselines)
+    for group in ("likes_left", "likes_right"):
+        for measure in ("best_recovery", "accurate_recovery"):
+            assert board.value("popl", group, measure) == pytest.approx(1, abs=0.05)
+    board = judge.score(walkers(4.0, 6.0), baselines)
+    for measure in ("best_recovery", "accurate_recovery"):
+        assert board.value("popl", "likes_left", measure) < 0
+        assert board.value("popl", "likes_right", measure) == pytest.approx(1, abs=0.05)
+
+
+def test_the_set_as_a_whole(judge, baselines):
+    """A set for one group covers half of the groups, and its fair choice serves the other badly."""
+    board = judge.score(walkers(9.0), baselines)
+    found = values(board, "popl", "all")
+    worst = board.value("popl", "likes_left", "recovery")
+    assert found["worst_recovery"] == worst < 0
+    assert found["coverage"] == 0.5
+    assert found["fair_recovery"] == pytest.approx(worst, abs=1e-6)
+    assert found["distinct"] == found["favourite_share"] == 1
+    assert found["effective"] == pytest.approx(1)
+    assert found["gain"] == found["gain_error"] == 0
+    assert found["further_accuracy"] == found["one_for_all_accuracy"]
+    assert 0 <= found["fair_worst_rater"] <= found["fair_quantile"] < 0.5
+    assert values(board, "oracle", "all") == {"worst_recovery": 1, "coverage": 1}
+    assert values(board, "cpl", "all")["coverage"] == 0
+
+
+def test_the_alarm_hears_a_collapse_and_no_healthy_set(judge, policies, baselines):
+    """Two ways to serve only one group, and a set that serves both."""
+    assert alarm(judge.score(policies, baselines).results) is None
+    for pulls in ([9.0], [4.0, 4.1, 3.9]):
+        assert "tells nobody apart" in alarm(judge.score(walkers(*pulls), baselines).results)
+
+
+def test_the_fair_choice_is_measured_on_others_than_chose_it(judge, policies):
+    choosing, measuring = judge.panels
+    assert len(choosing) == len(measuring) == 5 * 4 * 50
+    assert not torch.equal(choosing["pair"], measuring["pair"])
+    board = judge.score(policies, None)
+    scores = judge.scores(policies)[policies.fair(judge.bank, choosing)]
+    chosen = measuring["pair"].gather(1, measuring["answer"].unsqueeze(1)).squeeze(1)
+    other = measuring["pair"].gather(1, 1 - measuring["answer"].unsqueeze(1)).squeeze(1)
+    accuracy = (scores[chosen] > scores[other]).float().view(20, 50).mean(1)
+    assert board.value("popl", "all", "fair_worst_rater") == pytest.approx(float(accuracy.min()))
+
+
+def test_panels_have_the_shares_of_the_groups(judge):
+    skewed = Judge(
+        judge.acting,
+        ENV,
+        judge.config,
+        judge.groups,
+        judge.bank,
+        judge.worth,
+        shares=[1.0, 0.0],
+        seed=0,
+    )
+    panel = skewed.panels[0]
+    chosen = panel["pair"].gather(1, panel["answer"].unsqueeze(1)).squeeze(1)
+    other = panel["pair"].gather(1, 1 - panel["answer"].unsqueeze(1)).squeeze(1)
+    assert bool((judge.worth[0, chosen] > judge.worth[0, other]).all())

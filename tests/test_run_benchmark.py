@@ -117,7 +117,9 @@ def test_every_cell_is_run_once_and_the_results_are_put_together(trainer):
     assert of["cpl", 0] == 0.1
     assert len(of) == 10
     assert len(results[results.measure == "seconds"]) == 8
-    assert "| plain | **0.90 ± 0.06 [0.89]** |" in Path("out/report.md").read_text()
+    report = Path("out/report.md").read_text()
+    assert "| method | plain | noisy |" in report
+    assert "| popl | **0.90 ± 0.06 [0.89]** | **0.90 ± 0.06 [0.89]** |" in report
     assert len(pd.read_csv("out/cells.csv")) == 8
     assert not list(Path("out/logs").rglob("*.txt")), "nothing was printed"
 
@@ -379,7 +381,7 @@ def test_a_folder_of_another_suite(call, trainer):
 # For real
 
 
-@pytest.mark.parametrize("name", ["smoke", "stateless", "two_doors"])
+@pytest.mark.parametrize("name", ["smoke", "stateless", "sweeps", "two_doors"])
 def test_scenarios_and_methods_of_our_suites_are_configurations(name):
     suite = load_suite(name, folder=files("popl_rl.configs.suites"))
     cells = plan(suite, seeds=1)

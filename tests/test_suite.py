@@ -162,7 +162,7 @@ def test_a_file_that_is_no_yaml(tmp_path, text):
 
 
 def test_the_suites_of_the_package():
-    assert {"smoke", "stateless", "two_doors"} <= set(NAMES)
+    assert {"smoke", "stateless", "sweeps", "two_doors"} <= set(NAMES)
     stateless = load_suite("stateless", folder=SUITES)
     assert {axis: list(points.values()) for axis, points in stateless.axes().items()} == {
         "population": [10, 30, 100, 300, 1000],
@@ -172,6 +172,18 @@ def test_the_suites_of_the_package():
         "answers": [1, 5, 20, 50],
     }
     assert len(load_suite("two_doors", folder=SUITES).scenarios) == 6
+    sweeps = load_suite("sweeps", folder=SUITES)
+    assert {axis: list(points.values()) for axis, points in sweeps.axes().items()} == {
+        "groups": [2, 3, 4],
+        "minority": [5, 10, 20, 50],
+        "mistakes": [0, 10, 20, 30],
+        "rationality": ["always", "β = 10", "β = 3", "β = 1"],
+        "answers": [5, 20, 80],
+        "ids": ["with", "without"],
+        "population": [50, 100, 500, 1000],
+        "generations": [25, 50, 100, 200],
+        "agreement": [38, 50, 60, 70, 80, 90],
+    }
 
 
 @pytest.mark.parametrize("name", NAMES)

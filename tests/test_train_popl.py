@@ -1,5 +1,6 @@
 import json
 import math
+from dataclasses import replace
 
 import pandas as pd
 import pytest
@@ -140,6 +141,21 @@ def test_data_of_an_earlier_run_gives_the_same_policies(result, train):
     assert again.board.results.equals(result.board.results)
 
 
+def test_the_alarm_is_said_in_the_terminal(result, capsys):
+    for gain in (0.0, 1.0):
+        results = result.board.results.copy()
+        results.loc[results.measure == "gain", "value"] = gain
+        results.loc[results.measure == "gain_error", "value"] = 0.1
+        show(replace(result, board=replace(result.board, results=results)))
+        assert ("alarm: the set meets" in capsys.readouterr().out) == (gain == 0)
+
+
+def test_the_report_tells_how_new_raters_are_met(result):
+    report = (result.run_dir / "report.md").read_text()
+    assert "| new raters' further answers | " in report
+    assert "| POPL (catered) | all |" not in report, "a group of its own only in results.csv"
+
+
 def test_without_baselines(train):
     result = train("evaluation.baselines=false")
     assert set(result.board.results.method) == {"popl", "popl_lexicase", "random"}
@@ -180,14 +196,14 @@ def test_any_gymnasium_environment_with_raters_from_a_file(train, tmp_path):
     file = tmp_path / "my_raters.py"
     file.write_text(RATERS)
     result = train(*GYM, f"raters.groups=['{file}:slow','{file}:upright']")
-    groups = set(result.board.results.group)
+    groups = set(result.board.results.group) - {"all"}
     assert len(groups) == 2
     assert all(math.isfinite(result.board.value("popl", group, "return")) for group in groups)
 
 
 def test_three_doors_and_three_groups(train):
     result = train("raters=three_groups", "env.options.doors=3", "env.options.size=7")
-    assert set(result.board.results.group) == {"upper", "lower", "third"}
+    assert set(result.board.results.group) == {"upper", "lower", "third", "all"}
     assert len(PolicySet.load(result.run_dir / "baselines")) == 4
 
 
@@ -204,7 +220,7 @@ def test_an_environment_from_a_file(train, tmp_path):
         "env.max_steps=10",
         "raters.groups=['popl_rl.testing:likes_left','popl_rl.testing:likes_right']",
     )
-    groups = sorted(set(result.board.results.group))
+    groups = sorted(set(result.board.results.group) - {"all"})
     assert len(groups) == 2
     assert math.isnan(result.board.value("popl", groups[0], "success"))
     assert math.isfinite(result.board.value("popl", groups[0], "return"))

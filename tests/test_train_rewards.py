@@ -21,6 +21,7 @@ STATELESS = [
     "method.hidden=[8]",
     "evaluation.episodes=100",
     "evaluation.new_raters=2",
+    "evaluation.curve=[1,5]",
     "evaluation.pairs=200",
     "evaluation.baseline_steps=200",
     "evaluation.brex_steps=100",

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from popl_rl.config import Config, EvaluateConfig, validate
 from popl_rl.experiment import build_groups, build_spec, make_data
+from popl_rl.findings import alarm, findings
 from popl_rl.policy_set import PolicySet, RewardSet, load_set
 from popl_rl.report import markdown, results_table
 from popl_rl.results import Scoreboard, make_judge
@@ -59,7 +60,11 @@ def run(config: EvaluateConfig) -> tuple[Path, Scoreboard]:
     save_config(beside, OmegaConf.structured(config))
     write_atomic(beside / "results.csv", board.results.to_csv(index=False))
     title = f"Evaluation {number} of {run_dir.name}"
-    about = {"answers of each new rater": config.evaluation.answers, "seed": config.seed}
+    about = {
+        "answers of each new rater": config.evaluation.answers,
+        "seed": config.seed,
+        **findings(board, judge),
+    }
     report = markdown(board.results, title=title, about=about, figures=[])
     write_atomic(beside / "report.md", report)
     beside.rename(folder)
@@ -75,6 +80,9 @@ def main(cfg: Any) -> None:
     folder, board = run(cfg)
     console = Console()
     console.print(results_table(board.results))
+    warning = alarm(board.results)
+    if warning is not None:
+        console.print(f"alarm: {warning}", style="bold red", highlight=False, soft_wrap=True)
     console.print(f"written to {folder}", soft_wrap=True)
 
 

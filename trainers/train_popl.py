@@ -36,7 +36,7 @@ from popl_rl.experiment import (
     train_baselines,
     typical,
 )
-from popl_rl.findings import findings
+from popl_rl.findings import alarm, findings
 from popl_rl.loggers import make_logger
 from popl_rl.pictures import draw
 from popl_rl.policy_set import HypothesisSet, as_set
@@ -228,6 +228,9 @@ def show(result: Result) -> None:
     """Print the table and where everything is."""
     console = Console()
     console.print(results_table(result.board.results))
+    warning = alarm(result.board.results)
+    if warning is not None:
+        console.print(f"alarm: {warning}", style="bold red", highlight=False, soft_wrap=True)
     console.print(f"report, pictures, policies and logs: {result.run_dir}", soft_wrap=True)
 
 
