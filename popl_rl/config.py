@@ -7,6 +7,7 @@ from typing import Any
 from omegaconf import MISSING
 
 __all__ = [
+    "ALGORITHMS",
     "Config",
     "DataConfig",
     "EnvConfig",
@@ -18,6 +19,19 @@ __all__ = [
     "ResponseConfig",
     "validate",
 ]
+
+
+#: What ``method.algorithm`` may be, and what its rows are called in ``results.csv``; ``cpl`` are
+#: there the rows of the baseline.
+ALGORITHMS = {
+    "popl": "popl",
+    "cpl": "multi_cpl",
+    "multi_cpl": "multi_cpl",
+    "em": "em",
+    "vpl": "vpl",
+}
+
+_SELECTIONS = ("lexicase", "tournament", "best_sum", "random", "nsga2")
 
 
 @dataclass
@@ -73,13 +87,19 @@ class MethodConfig:
     """How the policies are learnt."""
 
     name: str = "popl"
+    algorithm: str = "popl"  # popl; to compare with: cpl (pooled), multi_cpl, em, vpl
+    selection: str = "lexicase"  # of parents: lexicase, tournament, best_sum, random, nsga2 (popl)
+    tournament: int = 4  # members in a tournament (selection=tournament)
+    groups: int = 2  # groups that the mixture is told there are (em)
+    latent: int = 8  # numbers that say what a rater wants (vpl)
+    kl: float = 0.1  # weight of their divergence from N(0, 1) (vpl)
     learns: str = "auto"  # policy, reward; auto: reward where there is nothing to do but judge
     cases: str = "rater"  # what lexicase filters on: rater (needs rater ids) or preference
     variation: str = "auto"  # gradient, gaussian (published), teams; auto goes by the cases
     evolve: str = "all"  # all: whole networks; head: last layers on a shared, frozen trunk
     features: str = "random"  # that trunk: random (published), or pooled: trained on all answers
-    members: int = 32  # policies in the population
-    generations: int = 100
+    members: int = 32  # policies in the population; em: as many mixtures as fit, the best is kept
+    generations: int = 100  # others than popl: blocks of method.steps CPL steps
     hidden: list[int] = field(default_factory=lambda: [64, 64])  # units of each hidden layer
     epsilon: str | None = "mad"  # tolerance of lexicase: mad, a number, or null for none
     alpha: float = 0.5  # scale of the scores (CPL's temperature)
@@ -197,11 +217,14 @@ def validate(config: Config) -> None:
     at_least_one(evaluation, "evaluation", "baseline_steps", "baseline_batch_size")
     at_least_one(method, "method", "generations", "steps", "batch_size")
     at_least_one(method, "method", "teams", "team_generations", "pooled_steps")
-    at_least_one(method, "method", "specialist_steps")
+    at_least_one(method, "method", "specialist_steps", "tournament", "groups", "latent")
+    expect(method.kl >= 0, "method.kl", "at least 0", method.kl)
     at_least_one(evaluation, "evaluation", "ppo_frames", "brex_steps", "dpl_steps")
     expect(evaluation.menu >= 2, "evaluation.menu", "at least 2, to choose", evaluation.menu)
     for name, value, known in (
         ("evaluation.optimiser", evaluation.optimiser, ("auto", "plan", "ppo")),
+        ("method.algorithm", method.algorithm, tuple(ALGORITHMS)),
+        ("method.selection", method.selection, _SELECTIONS),
         ("method.learns", method.learns, ("auto", "policy", "reward")),
         ("method.features", method.features, ("random", "pooled")),
     ):

@@ -62,8 +62,9 @@ def draw(
     metrics = pd.read_csv(run_dir / "metrics.csv")
     figures = {
         "learning": plots.learning_curves(metrics),
-        "selection": plots.selection(metrics),
     }
+    if "selection_depth" in metrics:
+        figures["selection"] = plots.selection(metrics)
     table = board.results
     measured = (table.measure == "recovery") & ~table.method.isin(["oracle", "random"])
     if table.value[measured].notna().any():
@@ -94,7 +95,7 @@ def draw(
     cells = getattr(world.env.unwrapped, "cells", None)
     if cells is not None:
         maps = {
-            f"set, catered to {name}": occupancy_map(board.episodes["popl", name], cells)
+            f"set, catered to {name}": occupancy_map(board.episodes[board.label, name], cells)
             for name in names
         }
         if baselines is not None:

@@ -40,11 +40,13 @@ class Scoreboard:
         results: Tidy rows ``method, group, measure, value``.
         catered: Member that a first new rater of each group was given, by group name.
         episodes: Episodes ``[1, E, H]`` behind the pictures, by method and group name.
+        label: Name of the method whose set was judged.
     """
 
     results: pd.DataFrame
     catered: dict[str, int]
     episodes: dict[tuple[str, str], TensorDict]
+    label: str = "popl"
 
     def value(self, method: str, group: str, measure: str) -> float:
         """One number of the table."""
@@ -132,14 +134,16 @@ class Judge:
         baselines: HypothesisSet | None,
         *,
         rivals: Rivals | None = None,
+        label: str = "popl",
     ) -> Scoreboard:
         """Fill the scoreboard.
 
         Args:
-            hypotheses: The set that POPL found.
+            hypotheses: The set that was found.
             baselines: One trained on everybody's answers, then one oracle per group; None to leave
                 them, and with them ``recovery``, out.
             rivals: Other learners of reward functions, for :class:`~popl_rl.acting.Choosing` alone.
+            label: Name of the method that found ``hypotheses``.
         """
         random = self.acting(None)
         base = None if baselines is None else self.acting(baselines)
@@ -147,11 +151,11 @@ class Judge:
         rows = _Rows(self.groups, self.env, random=random, oracle=oracle)
         catered: dict[str, int] = {}
         episodes: dict[tuple[str, str], TensorDict] = {}
-        sets = {"popl": hypotheses} | ({} if rivals is None else {"brex": rivals.brex})
-        for label, found in sets.items():
+        sets = {label: hypotheses} | ({} if rivals is None else {"brex": rivals.brex})
+        for whose, found in sets.items():
             accuracy = self.accuracy(found)
             for method in ("posterior", "lexicase"):
-                name = label if method == "posterior" else f"{label}_lexicase"
+                name = whose if method == "posterior" else f"{whose}_lexicase"
                 picks = self.cater(found, method)
                 used, position = picks.unique(return_inverse=True)
                 rolled = self.acting(found.subset(used.tolist()))
@@ -160,7 +164,7 @@ class Judge:
                     mean = float(accuracy[picks[index], index].mean())
                     rows.add(name, index, rolled, share / share.sum())
                     rows.add_accuracy(name, index, mean, float(accuracy[:, index].max()))
-                    if name == "popl":
+                    if name == label:
                         favourite = int(share.argmax())
                         catered[group.name] = int(used[favourite])
                         episodes[name, group.name] = rolled[favourite : favourite + 1]
@@ -168,17 +172,17 @@ class Judge:
             accuracy, one = self.accuracy(baselines), torch.ones(1)
             pooled = "cpl" if isinstance(baselines, PolicySet) else "bradley_terry"
             for index, group in enumerate(self.groups):
-                for label, row in ((pooled, 0), ("oracle", 1 + index)):
-                    rows.add(label, index, base[row : row + 1], one)
+                for name, row in ((pooled, 0), ("oracle", 1 + index)):
+                    rows.add(name, index, base[row : row + 1], one)
                     value = float(accuracy[row, index])
-                    rows.add_accuracy(label, index, value, value)
-                    episodes[label, group.name] = base[row : row + 1]
+                    rows.add_accuracy(name, index, value, value)
+                    episodes[name, group.name] = base[row : row + 1]
         if rivals is not None:
             self._score_distributional(rivals, rows)
         for index in range(len(self.groups)):
             rows.add("random", index, random, torch.ones(1))
         results = pd.DataFrame(rows.rows, columns=["method", "group", "measure", "value"])
-        return Scoreboard(results, catered, episodes)
+        return Scoreboard(results, catered, episodes, label)
 
     def _score_distributional(self, rivals: Rivals, rows: "_Rows") -> None:
         assert isinstance(self.acting, Choosing)

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from rich.console import Console
 
 from popl_rl.config import Config, EvaluateConfig, validate
-from popl_rl.experiment import build_groups, build_spec, make_data
+from popl_rl.experiment import build_groups, build_spec, label_of, make_data
 from popl_rl.policy_set import PolicySet, RewardSet, load_set
 from popl_rl.report import markdown, results_table
 from popl_rl.results import Scoreboard, make_judge
@@ -47,7 +47,7 @@ def run(config: EvaluateConfig) -> tuple[Path, Scoreboard]:
     )
     spec = build_spec(stored.method, world.env)
     judge = make_judge(stored, world, groups, data, spec, seed=config.seed)
-    board = judge.score(found, baselines)
+    board = judge.score(found, baselines, label=label_of(stored.method))
     number = 1 + len(list((run_dir / "evaluations").glob("[0-9]*")))
     folder = run_dir / "evaluations" / f"{number:03d}"
     beside = folder.with_name(f".{folder.name}")

@@ -30,6 +30,7 @@ from popl_rl.experiment import (
     build_spec,
     final_set,
     generations_of,
+    label_of,
     make_data,
     stream,
     train_baselines,
@@ -172,7 +173,8 @@ def run(config: Config) -> Result:
             )
 
         # 5. Judged by every hidden group; told in a table, in pictures and in words.
-        board = judge.score(found, baselines, rivals=rivals)
+        label = label_of(config.method)
+        board = judge.score(found, baselines, rivals=rivals, label=label)
         write_atomic(run_dir / "results.csv", board.results.to_csv(index=False))
         figures = draw(
             run_dir, found, baselines, board=board, judge=judge, world=world, rivals=rivals
@@ -189,7 +191,7 @@ def run(config: Config) -> Result:
     }
     text = markdown(
         board.results,
-        title=f"POPL: {config.method.name} in {config.env.factory}",
+        title=f"{'POPL: ' if label == 'popl' else ''}{config.method.name} in {config.env.factory}",
         about=about,
         figures=[Path("figures") / path.name for path in figures.values()],
     )
