@@ -12,6 +12,7 @@ from typing import Any
 
 import pandas as pd
 
+from popl_rl.config import ALGORITHMS
 from popl_rl.report import worst_recovery
 from popl_rl.runs import write_atomic, write_json
 from popl_rl.suite import Suite
@@ -21,7 +22,8 @@ __all__ = ["COLUMNS", "Cell", "claim", "collect", "is_finished", "plan", "worst"
 COLUMNS = ["suite", "scenario", "seed", "method", "group", "measure", "value"]
 """Columns of a benchmark's ``results.csv``."""
 
-_LEARNT = r"popl(_lexicase)?"  # what popl-train calls the method that it was asked for
+# What popl-train calls the method that it was asked for.
+_LEARNT = rf"(?:{'|'.join(sorted(set(ALGORITHMS.values())))})(?:_lexicase)?"
 
 
 @dataclass(frozen=True)
@@ -175,7 +177,8 @@ def _without(one: Any, other: Any) -> Any:
 def collect(suite: Suite, cells: Sequence[Cell], run_dir: Path) -> pd.DataFrame:
     """Put the results of finished cells together.
 
-    The rows ``popl`` and ``popl_lexicase`` of a cell get the name of its method. Rows of others,
+    The rows of what a cell was to train (``popl`` and ``popl_lexicase``, or ``em`` and
+    ``em_lexicase``, ...) get the name of its method. Rows of others,
     such as the oracle, are the same in all cells of a scenario and seed; those of the first method
     are kept. The wall time of a cell is its method's measure ``seconds`` of the group ``all``,
     missing for a cell that was resumed.
@@ -200,7 +203,8 @@ def collect(suite: Suite, cells: Sequence[Cell], run_dir: Path) -> pd.DataFrame:
         own = rows["method"].str.fullmatch(_LEARNT)
         if not cell.leads:
             rows, own = rows[own], own[own]
-        names = cell.method + rows["method"].str.removeprefix("popl")
+        suffix = rows["method"].str.endswith("_lexicase").map({True: "_lexicase", False: ""})
+        names = cell.method + suffix.astype(str)
         rows = rows.assign(method=rows["method"].where(~own, names))
         seconds = json.loads((folder / "cell.json").read_text(encoding="utf-8"))["seconds"]
         if seconds is not None:

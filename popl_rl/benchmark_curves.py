@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from popl_rl.benchmark import worst
 from popl_rl.benchmark_plots import _columns, _positions, _styles
-from popl_rl.plots import _LEGEND, PALETTE, _headline, _tidy
+from popl_rl.plot_style import PALETTE, headline, tidy
+from popl_rl.plots import _LEGEND
 from popl_rl.report import interval
 from popl_rl.suite import Suite
 
@@ -49,7 +50,7 @@ def scenario_dots(suite: Suite, results: pd.DataFrame) -> Figure:
     lines = math.ceil(len(scenarios) / columns)
     height = lines * (0.24 * len(methods) + 0.55) + 1.1
     fig = Figure(figsize=(2.6 * columns + 2.4, height))
-    _headline(
+    headline(
         fig,
         "How well is the worst-served group served?",
         "Recovery: 1 as good as the oracle, 0 as random actions; cut off below −0.5.\n"
@@ -76,7 +77,7 @@ def scenario_dots(suite: Suite, results: pd.DataFrame) -> Figure:
         ax.set_title(scenario, fontsize=10)
         ax.grid(axis="y", color="0.92")
         ax.set_axisbelow(True)
-        _tidy(ax)
+        tidy(ax)
     axes[0, 0].set_yticks(range(len(methods)), [suite.label(name) for name in methods])
     axes[0, 0].set(xlim=(low - 0.04, _HIGHEST + 0.04), ylim=(len(methods) - 0.5, -0.5))
     _switch_off(axes, len(scenarios))
@@ -111,7 +112,7 @@ def catering_curves(suite: Suite, results: pd.DataFrame) -> Figure:
     x[math.inf] = float(np.log10(answers[-1])) + 0.35
     styles = _styles(suite, methods)
     fig = Figure(figsize=(9.2, 1.9 * len(scenarios) + 1.6 + 0.2 * len(methods) / _columns_of(9.2)))
-    _headline(
+    headline(
         fig,
         "How many answers does it take to find a new rater's policy?",
         "Recovery of the worst-served group, with 95 % intervals over seeds. On the right: of the "
@@ -128,7 +129,7 @@ def catering_curves(suite: Suite, results: pd.DataFrame) -> Figure:
             ax.axhline(1, color="black", linewidth=1, linestyle="--", zorder=0)
             ax.set_xticks(list(x.values()), [*(f"{number:g}" for number in answers), "best"])
             ax.xaxis.set_minor_locator(NullLocator())
-            _tidy(ax)
+            tidy(ax)
             if row == 0:
                 ax.set_title(kind, fontsize=10)
         axes[row, 0].set_ylabel(f"{scenario}\nrecovery")
@@ -164,7 +165,7 @@ def recovery_along_axes(suite: Suite, results: pd.DataFrame) -> Figure:
     columns = min(3, len(drawn))
     lines = math.ceil(len(drawn) / columns)
     fig = Figure(figsize=(max(2.8 * columns + 0.6, 5.6), 2.3 * lines + 1.5))
-    _headline(
+    headline(
         fig,
         "What makes it harder to serve everybody?",
         "Recovery of the worst-served group, with 95 % intervals over seeds; cut off below −0.5.",
@@ -181,7 +182,7 @@ def recovery_along_axes(suite: Suite, results: pd.DataFrame) -> Figure:
         ax.xaxis.set_minor_locator(NullLocator())
         ax.axhline(1, color="black", linewidth=1, linestyle="--", zorder=0)
         ax.set_xlabel(axis)
-        _tidy(ax)
+        tidy(ax)
     for row in axes:
         row[0].set_ylabel("recovery")
     axes[0, 0].set_ylim(low - 0.03, _HIGHEST)

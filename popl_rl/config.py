@@ -7,6 +7,7 @@ from typing import Any
 from omegaconf import MISSING
 
 __all__ = [
+    "ALGORITHMS",
     "Config",
     "DataConfig",
     "EnvConfig",
@@ -18,6 +19,19 @@ __all__ = [
     "ResponseConfig",
     "validate",
 ]
+
+
+#: What ``method.algorithm`` may be, and what its rows are called in ``results.csv``; ``cpl`` are
+#: there the rows of the baseline.
+ALGORITHMS = {
+    "popl": "popl",
+    "cpl": "multi_cpl",
+    "multi_cpl": "multi_cpl",
+    "em": "em",
+    "vpl": "vpl",
+}
+
+_SELECTIONS = ("lexicase", "tournament", "best_sum", "random", "nsga2")
 
 
 @dataclass
@@ -76,6 +90,12 @@ class MethodConfig:
     """How the policies are learnt."""
 
     name: str = "popl"
+    algorithm: str = "popl"  # popl; to compare with: cpl (pooled), multi_cpl, em, vpl
+    selection: str = "lexicase"  # of parents: lexicase, tournament, best_sum, random, nsga2 (popl)
+    tournament: int = 4  # members in a tournament (selection=tournament)
+    groups: int = 2  # groups that the mixture is told there are (em)
+    latent: int = 8  # numbers that say what a rater wants (vpl)
+    kl: float = 0.1  # weight of their divergence from N(0, 1) (vpl)
     learns: str = "auto"  # policy, reward; auto: reward where there is nothing to do but judge
     cases: str = "rater"  # what lexicase filters on: rater (needs rater ids) or preference
     variation: str = "auto"  # gradient, gaussian (published), teams; auto goes by the cases
@@ -85,8 +105,8 @@ class MethodConfig:
     clone_steps: int = 3000  # gradient steps of behaviour cloning (code)
     clone_beta: float = 1e-3  # weight of the codes' divergence from their prior (code)
     features: str = "random"  # that trunk: random (published), or pooled: trained on all answers
-    members: int = 32  # policies in the population
-    generations: int = 100
+    members: int = 32  # policies in the population; em: as many mixtures as fit, the best is kept
+    generations: int = 100  # others than popl: blocks of method.steps CPL steps
     hidden: list[int] = field(default_factory=lambda: [64, 64])  # units of each hidden layer
     epsilon: str | None = "mad"  # tolerance of lexicase: mad, a number, or null for none
     alpha: float = 0.5  # scale of the scores (CPL's temperature)
@@ -119,8 +139,8 @@ class EvaluationConfig:
     optimiser: str = "auto"  # how reward functions act: plan, ppo; auto: plan if there is a table
     ppo_frames: int = 100_000  # frames of PPO for each of them
     greedy: bool = False  # most likely actions instead of sampled ones
-    reference: str = "random"  # whose return is a recovery of 0: random actions, or a clone of the
-    # data's typical behaviour, which needs no preferences
+    reference: str = "random"  # whose return is a recovery of 0: random; clone: of the data's
+    # typical behaviour; others: the oracle of whichever other group suits a group least
     baselines: bool = True  # train pooled CPL and the oracle too
     baselines_from: str | None = None  # folder 'baselines' of a run on the same data; not trained
     reward_baselines: bool = True  # B-REX and DPL too, where items are judged
@@ -214,11 +234,15 @@ def validate(config: Config) -> None:
     at_least_one(method, "method", "generations", "steps", "batch_size")
     at_least_one(method, "method", "teams", "team_generations", "pooled_steps")
     at_least_one(method, "method", "specialist_steps", "code_dim", "clone_steps")
+    at_least_one(method, "method", "tournament", "groups", "latent")
+    expect(method.kl >= 0, "method.kl", "at least 0", method.kl)
     at_least_one(evaluation, "evaluation", "ppo_frames", "brex_steps", "dpl_steps")
     expect(evaluation.menu >= 2, "evaluation.menu", "at least 2, to choose", evaluation.menu)
     for name, value, known in (
         ("evaluation.optimiser", evaluation.optimiser, ("auto", "plan", "ppo")),
-        ("evaluation.reference", evaluation.reference, ("random", "clone")),
+        ("evaluation.reference", evaluation.reference, ("random", "clone", "others")),
+        ("method.algorithm", method.algorithm, tuple(ALGORITHMS)),
+        ("method.selection", method.selection, _SELECTIONS),
         ("method.learns", method.learns, ("auto", "policy", "reward")),
         ("method.features", method.features, ("random", "pooled")),
     ):

@@ -8,28 +8,34 @@ import gymnasium
 import torch
 from tensordict import TensorDictBase
 
+from popl_rl.alternatives import build_alternative
 from popl_rl.baselines import group_weights, train_cpl
 from popl_rl.comparisons import Comparisons
-from popl_rl.config import EvaluationConfig, MethodConfig, parse_epsilon
+from popl_rl.config import ALGORITHMS, EvaluationConfig, MethodConfig, parse_epsilon
 from popl_rl.data import Data, build_groups, fresh_segments, make_data, stream
+from popl_rl.em import EM
 from popl_rl.keys import ANSWER, GROUP, Answer
 from popl_rl.kinship import seed_with_specialists
 from popl_rl.losses import CPLLoss
+from popl_rl.multi_cpl import MultiCPL
 from popl_rl.policies import PolicySpec, build_network
 from popl_rl.policy_set import HypothesisSet, as_set, load_set
 from popl_rl.popl import POPL
 from popl_rl.population import Population
 from popl_rl.rewards import RewardSpec, reward_bank
 from popl_rl.segments import SegmentBank
+from popl_rl.selection import selection_of
 from popl_rl.store import locked
 from popl_rl.styled_population import StyledPopulation
 from popl_rl.styles import StyleClone, load_clone, save_clone, train_clone
 from popl_rl.teams import TeamPOPL, TeamSettings
 from popl_rl.variation import GaussianHead, GradientCPL
+from popl_rl.vpl import VPL
 from popl_rl.worlds import has_nothing_to_do
 
 __all__ = [
     "Data",
+    "Learner",
     "build_bank",
     "build_clone",
     "build_groups",
@@ -38,12 +44,16 @@ __all__ = [
     "final_set",
     "fresh_segments",
     "generations_of",
+    "label_of",
     "make_data",
     "stream",
     "train_baselines",
     "typical",
     "variation_of",
 ]
+
+Learner = POPL | TeamPOPL | MultiCPL | EM | VPL
+"""What trains generation by generation, and has a population after each."""
 
 
 def build_spec(config: MethodConfig, env: gymnasium.Env[Any, Any]) -> PolicySpec | RewardSpec:
@@ -118,14 +128,20 @@ def build_popl(
     *,
     clone: StyleClone | None = None,
     generator: torch.Generator,
-) -> POPL | TeamPOPL:
+) -> Learner:
     """Build the trainer's inner loop; a warmed-up population, nothing selected yet.
 
     ``variation: auto`` means gradient variation for rater cases and teams for preference cases.
     Members are style codes if ``clone`` is given.
+
+    Raises:
+        ValueError: If settings do not go together, or a package that they need is missing.
     """
     # Conservatism keeps policies near the data; of reward functions only differences matter.
     conservatism = config.conservatism if isinstance(spec, PolicySpec) else 1.0
+    if config.algorithm != "popl":
+        return build_alternative(config, spec, bank, comparisons, clone=clone, generator=generator)
+    select = selection_of(config.selection, tournament=config.tournament)
     if variation_of(config) == "teams":
         settings = TeamSettings(
             teams=config.teams,
@@ -135,7 +151,9 @@ def build_popl(
             discount=config.discount,
             learning_rate=config.learning_rate,
         )
-        return TeamPOPL(spec, bank, comparisons, settings=settings, generator=generator)
+        return TeamPOPL(
+            spec, bank, comparisons, settings=settings, select=select, generator=generator
+        )
     if clone is not None:
         codes = clone.draw(config.members, generator=generator)
         population: Population = StyledPopulation(clone, codes)
@@ -193,6 +211,7 @@ def build_popl(
         discount=config.discount,
         epsilon=cast("Any", parse_epsilon(config.epsilon)),
         kin=kin,
+        select=select,
         generator=generator,
     )
 
@@ -239,12 +258,18 @@ def variation_of(config: MethodConfig) -> str:
 
 def generations_of(config: MethodConfig) -> int:
     """Generations that a run of this method takes; those of teams are longer and fewer."""
-    return config.team_generations if variation_of(config) == "teams" else config.generations
+    teams = config.algorithm == "popl" and variation_of(config) == "teams"
+    return config.team_generations if teams else config.generations
 
 
-def final_set(popl: POPL | TeamPOPL) -> HypothesisSet:
+def label_of(config: MethodConfig) -> str:
+    """What the rows of this method are called in ``results.csv``."""
+    return ALGORITHMS[config.algorithm]
+
+
+def final_set(popl: Learner) -> HypothesisSet:
     """The policies, or reward functions, that a finished run has found."""
-    if isinstance(popl, TeamPOPL):
+    if isinstance(popl, TeamPOPL | EM | VPL):
         return popl.policies()
     everybody = as_set(popl.population, alpha=popl.alpha, discount=popl.discount)
     return everybody.distinct(popl.bank, popl.comparisons)

@@ -6,7 +6,8 @@ import torch
 from popl_rl.acting import Choosing
 from popl_rl.keys import OBSERVATION
 from popl_rl.majority import find_cycle, majority
-from popl_rl.results import Judge, Scoreboard
+from popl_rl.results import Judge
+from popl_rl.scoreboard import Scoreboard
 
 __all__ = ["alarm", "findings"]
 

@@ -13,8 +13,9 @@ from popl_rl.evaluation import mean_and_peak, steps_to_success
 from popl_rl.keys import INFO
 from popl_rl.motion_plots import plane, profiles
 from popl_rl.policy_set import HypothesisSet, PolicySet
-from popl_rl.results import Judge, Scoreboard
+from popl_rl.results import Judge
 from popl_rl.rollouts import MASK
+from popl_rl.scoreboard import Scoreboard
 from popl_rl.worlds import World
 
 __all__ = ["animate", "draw_motion", "profile"]

@@ -64,9 +64,7 @@ def draw_panel(
     """
     people = Raters.draw(groups, num_raters=raters, shares=shares, generator=generator)
     said = [
-        new_rater_answers(
-            groups, group, worth, answers=answers, start=start, generator=generator
-        )
+        new_rater_answers(groups, group, worth, answers=answers, start=start, generator=generator)
         for group in people.group_of.tolist()
     ]
     panel: TensorDict = torch.cat(said)

@@ -14,10 +14,11 @@ from popl_rl.keys import INFO
 from popl_rl.motion_pictures import animate, draw_motion
 from popl_rl.plot_style import save
 from popl_rl.policy_set import HypothesisSet
-from popl_rl.results import Judge, Scoreboard
+from popl_rl.results import Judge
 from popl_rl.reward_baselines import Rivals
 from popl_rl.reward_pictures import draw_rewards
 from popl_rl.rollouts import MASK
+from popl_rl.scoreboard import Scoreboard
 from popl_rl.worlds import World
 
 __all__ = ["draw", "occupancy_map"]
@@ -65,8 +66,9 @@ def draw(
     metrics = pd.read_csv(run_dir / "metrics.csv")
     figures = {
         "learning": plots.learning_curves(metrics),
-        "selection": plots.selection(metrics),
     }
+    if "selection_depth" in metrics:
+        figures["selection"] = plots.selection(metrics)
     table = board.results
     measured = (table.measure == "recovery") & ~table.method.isin(["oracle", "random"])
     if table.value[measured].notna().any():
@@ -97,7 +99,7 @@ def draw(
     cells = getattr(world.env.unwrapped, "cells", None)
     if cells is not None:
         maps = {
-            f"set, catered to {name}": occupancy_map(board.episodes["popl", name], cells)
+            f"set, catered to {name}": occupancy_map(board.episodes[board.label, name], cells)
             for name in names
         }
         if baselines is not None:

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 from numpy.typing import ArrayLike, NDArray
 
+from popl_rl.method_names import METHODS, method_name
 from popl_rl.plot_style import PALETTE, headline, tidy
 
 __all__ = [
@@ -32,26 +33,12 @@ __all__ = [
     "selection",
 ]
 
-METHODS = {
-    "popl": "POPL (catered)",
-    "popl_lexicase": "POPL (catered by lexicase)",
-    "cpl": "CPL on everybody's answers",
-    "bradley_terry": "Bradley–Terry on everybody's answers",
-    "brex": "B-REX (catered)",
-    "brex_lexicase": "B-REX (catered by lexicase)",
-    "dpl_mean_variance": "DPL, mean and variance",
-    "dpl_mean_variance_risk_averse": "DPL, mean and variance, risk-averse",
-    "dpl_categorical": "DPL, categorical",
-    "dpl_categorical_risk_averse": "DPL, categorical, risk-averse",
-    "oracle": "oracle (told the groups)",
-    "clone": "clone of the data",
-    "random": "random actions",
-}
-"""Names to print for the methods of a results table, in the order to show them in."""
 
 _METHOD_COLOURS = {
     "popl": PALETTE["blue"],
     "popl_lexicase": PALETTE["sky"],
+    **dict.fromkeys(("multi_cpl", "em", "vpl"), PALETTE["blue"]),
+    **dict.fromkeys(("multi_cpl_lexicase", "em_lexicase", "vpl_lexicase"), PALETTE["sky"]),
     "cpl": PALETTE["orange"],
     "bradley_terry": PALETTE["orange"],
     "oracle": PALETTE["black"],
@@ -60,11 +47,6 @@ _METHOD_COLOURS = {
 _OTHERS = (PALETTE["green"], PALETTE["purple"], PALETTE["vermilion"])
 _COLOURS = tuple(PALETTE[name] for name in ("blue", "vermilion", "green", "purple", "sky"))
 _LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 9}
-
-
-def method_name(method: str) -> str:
-    """Name to print for a method of a results table."""
-    return METHODS.get(method, method)
 
 
 def occupancy(

@@ -11,14 +11,12 @@ from torch import Tensor
 
 from popl_rl.comparisons import Comparisons
 from popl_rl.downsampling import spread_out
-from popl_rl.lexicase import lexicase_given_first, lexicase_report
+from popl_rl.lexicase import SelectionReport, lexicase_given_first, lexicase_report
 from popl_rl.population import Population, segment_scores
 from popl_rl.segments import SegmentBank
+from popl_rl.selection import Selection, report
 from popl_rl.variation import Variation
 
-#: What a child learns from kin on whom its parent is weak, against 1 where it is strong. Without
-#: it a first child for a small group learns from the one or two raters that its parent happens to
-#: pass; much more of it blurs groups that are each other's nearest.
 #: What a child learns from kin on whom its parent is weak, against 1 where it is strong. Without
 #: it a first child for a small group learns from the one or two raters that its parent happens to
 #: pass; much more of it blurs groups that are each other's nearest.
@@ -78,6 +76,8 @@ class POPL:
             given, a child is selected for one rater, whose case comes first in its order, and
             learns from raters akin to that one. Half of these raters are random, the others unlike
             each other, so that small groups are not overlooked.
+        select: Rule that takes the place of lexicase selection; for whom children are, and what
+            they learn, stays as it is.
         generator: Source of all randomness.
 
     Attributes:
@@ -95,6 +95,7 @@ class POPL:
         discount: float = 1.0,
         epsilon: float | Literal["mad"] | None = "mad",
         kin: Tensor | None = None,
+        select: Selection | None = None,
         generator: torch.Generator,
     ) -> None:
         self.population = population
@@ -105,6 +106,7 @@ class POPL:
         self.discount = discount
         self.epsilon = epsilon
         self.kin = kin
+        self.select = select
         self.generator = generator
         self.generation = 0
 
@@ -124,27 +126,30 @@ class POPL:
         tolerance = mad(values) if self.epsilon == "mad" else self.epsilon
         strong = values >= values.amax(0) - (0.0 if tolerance is None else tolerance)
         first = None if self.kin is None else self._first_raters(self.kin)
-        if first is None:
-            report = lexicase_report(
-                values, len(self.population), epsilon=tolerance, generator=self.generator
-            )
-        else:
-            report = lexicase_given_first(
-                values, first, epsilon=tolerance, generator=self.generator
-            )
-        strength = strong.float()[report.parents]
+        selected = self._select(values, first, tolerance)
+        strength = strong.float()[selected.parents]
         if self.kin is not None and first is not None:
             strength = (strength + _FLOOR) * self.kin[first].clamp(min=0)
-        varied = self.variation(report.parents, strength[:, self.comparisons.case])
+        varied = self.variation(selected.parents, strength[:, self.comparisons.case])
         self.generation += 1
         return {
             "worst_rater_accuracy": rater_accuracy(values),
             "mean_accuracy": float(passes.float().mean()),
-            "selection_depth": float(report.depth.float().mean()),
-            "distinct": float(report.distinct),
-            "effective_parents": report.effective,
+            "selection_depth": float(selected.depth.float().mean()),
+            "distinct": float(selected.distinct),
+            "effective_parents": selected.effective,
             **varied,
         }
+
+    def _select(
+        self, values: Tensor, first: Tensor | None, tolerance: float | Tensor | None
+    ) -> SelectionReport:
+        count, generator = len(self.population), self.generator
+        if self.select is not None:
+            return report(values, self.select(values, count, generator=generator))
+        if first is None:
+            return lexicase_report(values, count, epsilon=tolerance, generator=generator)
+        return lexicase_given_first(values, first, epsilon=tolerance, generator=generator)
 
     def _first_raters(self, kin: Tensor) -> Tensor:
         """For whom the children are: half at random, half unlike each other, ``[N]``."""

@@ -14,7 +14,6 @@ group that it serves worst.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import pandas as pd
@@ -29,15 +28,10 @@ from popl_rl.evaluation import (
     group_accuracy,
     group_returns,
     held_out_pairs,
-    info_rates,
-    mean_and_peak,
     new_rater_answers,
-    recovery,
-    steps_to_success,
-    success_rate,
 )
 from popl_rl.experiment import Data, build_bank, fresh_segments, stream
-from popl_rl.hindsight import best_in_hindsight, coverage, lowest, to_roll
+from popl_rl.hindsight import best_in_hindsight, lowest, to_roll
 from popl_rl.keys import RATER
 from popl_rl.panel import draw_panel, favourites, gain
 from popl_rl.policies import PolicySpec
@@ -48,35 +42,15 @@ from popl_rl.preferences import starts_of
 from popl_rl.raters import RaterGroup
 from popl_rl.reward_baselines import Rivals
 from popl_rl.rewards import RewardSpec
+from popl_rl.scoreboard import Rows, Scoreboard, Served
 from popl_rl.segments import SegmentBank
 from popl_rl.worlds import World, has_nothing_to_do
 
-__all__ = ["Judge", "Scoreboard", "make_judge"]
+__all__ = ["Judge", "make_judge"]
 
 _CATERING = {"posterior": "", "lexicase": "_lexicase"}  # what it adds to a method's name
 _PANEL = 5  # raters of each of two panels, for each new rater of a group
 _PANEL_ANSWERS = 50
-
-
-@dataclass(frozen=True)
-class Scoreboard:
-    """What came out.
-
-    Attributes:
-        results: Tidy rows ``method, group, measure, value``.
-        catered: Member that a first new rater of each group was given, by group name.
-        episodes: Episodes ``[1, E, H]`` behind the pictures, by method and group name.
-    """
-
-    results: pd.DataFrame
-    catered: dict[str, int]
-    episodes: dict[tuple[str, str], TensorDict]
-
-    def value(self, method: str, group: str, measure: str) -> float:
-        """One number of the table."""
-        rows = self.results
-        chosen = rows[(rows.method == method) & (rows.group == group) & (rows.measure == measure)]
-        return float(chosen.value.iloc[0])
 
 
 class Judge:
@@ -90,7 +64,7 @@ class Judge:
         bank: Segments to judge on.
         worth: Worth of each segment to each group, ``[G, N]``.
         start: Which segments may be compared, ``[N]``; all if None.
-        reference: A policy whose return is a recovery of 0; random actions if None.
+        clone: A clone of the data's typical behaviour, for comparison; None for none.
         shares: Chance that a rater is of each group; equal if None.
         seed: Seed of the run.
     """
@@ -105,13 +79,13 @@ class Judge:
         worth: Tensor,
         *,
         start: Tensor | None = None,
-        reference: HypothesisSet | None = None,
+        clone: HypothesisSet | None = None,
         shares: Sequence[float] | None = None,
         seed: int,
     ) -> None:
         self.acting, self.env, self.config = acting, env, config
         self.groups, self.bank, self.worth = groups, bank, worth
-        self.start, self.reference = start, reference
+        self.start, self.clone = start, clone
         self.shares, self.seed = shares, seed
         generator = stream(seed, "held-out pairs")
         self.pairs = {
@@ -213,30 +187,33 @@ class Judge:
         baselines: HypothesisSet | None,
         *,
         rivals: Rivals | None = None,
+        label: str = "popl",
     ) -> Scoreboard:
         """Fill the scoreboard.
 
         Args:
-            hypotheses: The set that POPL found.
+            hypotheses: The set that was found.
             baselines: One trained on everybody's answers, then one oracle per group; None to leave
                 them, and with them ``recovery``, out.
             rivals: Other learners of reward functions, for :class:`~popl_rl.acting.Choosing` alone.
+            label: Name of the method that found ``hypotheses``.
         """
         random = self.acting(None)
         base = None if baselines is None else self.acting(baselines)
-        oracle = None if base is None else group_returns(base[1:], self.groups).diagonal()
-        reference = random if self.reference is None else self.acting(self.reference)
-        rows = _Rows(self.groups, self.env, reference=reference, oracle=oracle)
+        cloned = None if self.clone is None else self.acting(self.clone)
+        # What each oracle, in the rows, is worth to each group.
+        worth = None if base is None else group_returns(base[1:], self.groups)
+        rows = self._rows(random, cloned, worth)
         catered: dict[str, int] = {}
         episodes: dict[tuple[str, str], TensorDict] = {}
-        sets = {"popl": hypotheses} | ({} if rivals is None else {"brex": rivals.brex})
+        sets = {label: hypotheses} | ({} if rivals is None else {"brex": rivals.brex})
         pooled_scores = None if baselines is None else self.scores(baselines)[0]
-        for label, found in sets.items():
+        for whose, found in sets.items():
             # Curves of what is judged; what it is compared with has too many members for them.
             curve = sorted(set(self.config.curve)) if found is hypotheses else []
-            served = self._serve(found, label, rows, curve=curve)
-            self._score_as_a_whole(found, label, rows, served, pooled_scores)
-            if label == "popl":
+            served = self._serve(found, whose, rows, curve=curve)
+            self._score_as_a_whole(found, whose, rows, served, pooled_scores)
+            if found is hypotheses:
                 for index, group in enumerate(self.groups):
                     place = int(served.share(index, served.picks["posterior"]).argmax())
                     catered[group.name] = served.members[place]
@@ -245,24 +222,36 @@ class Judge:
             accuracy, one = self.accuracy(baselines), torch.ones(1)
             pooled = "cpl" if isinstance(baselines, PolicySet) else "bradley_terry"
             for index, group in enumerate(self.groups):
-                for label, row in ((pooled, 0), ("oracle", 1 + index)):
-                    rows.add(label, index, base[row : row + 1], one)
+                for name, row in ((pooled, 0), ("oracle", 1 + index)):
+                    rows.add(name, index, base[row : row + 1], one)
                     value = float(accuracy[row, index])
-                    rows.add_accuracy(label, index, value, value)
-                    episodes[label, group.name] = base[row : row + 1]
+                    rows.add_accuracy(name, index, value, value)
+                    episodes[name, group.name] = base[row : row + 1]
         if rivals is not None:
             self._score_distributional(rivals, rows)
         for index in range(len(self.groups)):
-            if self.reference is not None:
-                rows.add("clone", index, reference, torch.ones(1))
+            if cloned is not None:
+                rows.add("clone", index, cloned, torch.ones(1))
             rows.add("random", index, random, torch.ones(1))
         rows.add_worst()
         results = pd.DataFrame(rows.rows, columns=["method", "group", "measure", "value"])
-        return Scoreboard(results, catered, episodes)
+        return Scoreboard(results, catered, episodes, label)
+
+    def _rows(self, random: TensorDict, cloned: TensorDict | None, worth: Tensor | None) -> Rows:
+        """Rows to fill, which know the returns that are a recovery of 0 and of 1."""
+        if self.config.reference == "others" and worth is not None:
+            alien = worth.masked_fill(torch.eye(len(worth), dtype=torch.bool), torch.inf)
+            floor = alien.amin(0)
+        elif self.config.reference == "clone" and cloned is not None:
+            floor = group_returns(cloned, self.groups)[0]
+        else:
+            floor = group_returns(random, self.groups)[0]
+        oracle = torch.full_like(floor, torch.nan) if worth is None else worth.diagonal()
+        return Rows(self.groups, self.env, floor=floor, oracle=oracle)
 
     def _serve(
-        self, found: HypothesisSet, label: str, rows: "_Rows", *, curve: Sequence[int]
-    ) -> "_Served":
+        self, found: HypothesisSet, label: str, rows: "Rows", *, curve: Sequence[int]
+    ) -> "Served":
         """What new raters are given, and what it is worth to them beside the best there is."""
         accuracy = self.accuracy(found)
         picks = {method: self.cater(found, method) for method in _CATERING}
@@ -278,7 +267,7 @@ class Judge:
         limit = 0 if isinstance(self.acting, Optimising) else self.config.curve_members
         members = to_roll(always, points, limit=limit)
         rolled = self.acting(found.subset(members))
-        served = _Served(picks, members, rolled, int(fair))
+        served = Served(picks, members, rolled, int(fair))
         returns = group_returns(rolled, self.groups)
         halves = rolled[:, ::2], rolled[:, 1::2] if rolled.shape[1] > 1 else rolled
         best = best_in_hindsight(*(group_returns(half, self.groups) for half in halves))
@@ -305,8 +294,8 @@ class Judge:
         self,
         found: HypothesisSet,
         label: str,
-        rows: "_Rows",
-        served: "_Served",
+        rows: "Rows",
+        served: "Served",
         pooled: Tensor | None,
     ) -> None:
         """What a set is worth to raters whose group nobody knows: rows of the group ``all``."""
@@ -338,7 +327,7 @@ class Judge:
             (label, "all", "fair_recovery", lowest(recoveries)),
         ]
 
-    def _score_distributional(self, rivals: Rivals, rows: "_Rows") -> None:
+    def _score_distributional(self, rivals: Rivals, rows: "Rows") -> None:
         assert isinstance(self.acting, Choosing)
         for label, score in rivals.scores(self.bank).items():
             chosen = self.acting.choose(score.cpu().unsqueeze(0))
@@ -351,94 +340,6 @@ class Judge:
             rows.rows.append((f"dpl_{kind}", "all", "hidden_context", context))
 
 
-@dataclass(frozen=True)
-class _Served:
-    """Members that were rolled out, and who was given which.
-
-    Attributes:
-        picks: Member of each new rater ``[G, raters]``, by kind of catering.
-        members: Members that were rolled out.
-        rolled: Their episodes, ``[len(members), E, H]``.
-        fair: The fair choice.
-    """
-
-    picks: dict[str, Tensor]
-    members: list[int]
-    rolled: TensorDict
-    fair: int
-
-    def share(self, index: int, picks: Tensor) -> Tensor:
-        """Share of a group's new raters that are given each of the members rolled out."""
-        given = (picks[index].unsqueeze(1) == torch.tensor(self.members)).float()
-        return given.mean(0)
-
-
-class _Rows:
-    """Tidy rows in the making."""
-
-    def __init__(
-        self,
-        groups: Sequence[RaterGroup],
-        env: EnvConfig,
-        *,
-        reference: TensorDict,
-        oracle: Tensor | None,
-    ) -> None:
-        self.groups, self.env = groups, env
-        self.reference = group_returns(reference, groups)[0]
-        self.oracle = torch.full_like(self.reference, float("nan")) if oracle is None else oracle
-        self.rows: list[tuple[str, str, str, float]] = []
-
-    def add(self, method: str, index: int, rolled: TensorDict, share: Tensor) -> None:
-        """What a method does for one group: policies ``[P, E, H]``, weighted by ``share``."""
-        group = self.groups[index].name
-        value = float(group_returns(rolled, self.groups)[:, index] @ share)
-        self.add_return(method, index, "", value)
-        success = float(success_rate(rolled, self.env.success) @ share)
-        self.rows.append((method, group, "success", success))
-        if self.env.measured:
-            steps = float(steps_to_success(rolled, self.env.success) @ share)
-            self.rows.append((method, group, "steps", steps))
-        for name in self.env.measured:
-            for what, values in zip(("mean", "peak"), mean_and_peak(rolled, name), strict=True):
-                self.rows.append((method, group, f"{what}_{name}", float(values @ share)))
-        if self.env.door is not None:
-            for door, rate in info_rates(rolled, self.env.door).items():
-                if door >= 0:
-                    name = f"{self.env.door}_{door}"
-                    self.rows.append((method, group, name, float(rate @ share)))
-
-    def recovery(self, index: int, value: float) -> float:
-        """What a return to a group is between the reference and the group's oracle."""
-        low, high = float(self.reference[index]), float(self.oracle[index])
-        return recovery(value, reference=low, oracle=high)
-
-    def add_return(self, method: str, index: int, prefix: str, value: float) -> None:
-        """A return to one group, and the recovery that this is."""
-        self.add_value(method, index, f"{prefix}return", value)
-        self.add_value(method, index, f"{prefix}recovery", self.recovery(index, value))
-
-    def add_value(self, method: str, index: int, measure: str, value: float) -> None:
-        """Any number about a method and a group."""
-        self.rows.append((method, self.groups[index].name, measure, value))
-
-    def add_worst(self) -> None:
-        """What each method's recoveries of all groups come to."""
-        found: dict[str, list[float]] = {}
-        for method, _, measure, value in self.rows:
-            if measure == "recovery":
-                found.setdefault(method, []).append(value)
-        for method, values in found.items():
-            self.rows.append((method, "all", "worst_recovery", lowest(values)))
-            self.rows.append((method, "all", "coverage", coverage(values)))
-
-    def add_accuracy(self, method: str, index: int, catered: float, best: float) -> None:
-        """How well a method ranks for one group."""
-        group = self.groups[index].name
-        self.rows.append((method, group, "accuracy", catered))
-        self.rows.append((method, group, "best_accuracy", best))
-
-
 def make_judge(
     config: Config,
     world: World,
@@ -446,7 +347,7 @@ def make_judge(
     data: Data,
     spec: PolicySpec | RewardSpec,
     *,
-    reference: HypothesisSet | None = None,
+    clone: HypothesisSet | None = None,
     seed: int,
 ) -> Judge:
     """The judge that fits what is learnt and where.
@@ -460,7 +361,7 @@ def make_judge(
         groups: G groups.
         data: Segments, and their worth.
         spec: Sizes of the hypotheses.
-        reference: A policy whose return is a recovery of 0; random actions if None.
+        clone: A clone of the data's typical behaviour, for comparison; None for none.
         seed: Seed of the evaluation.
 
     Raises:
@@ -498,7 +399,7 @@ def make_judge(
         bank,
         data.worth,
         start=starts_of(data.steps),
-        reference=reference,
+        clone=clone,
         shares=config.raters.shares,
         seed=seed,
     )

@@ -8,8 +8,9 @@ from popl_rl.acting import Choosing
 from popl_rl.keys import OBSERVATION
 from popl_rl.majority import find_cycle, majority
 from popl_rl.policy_set import HypothesisSet, RewardSet
-from popl_rl.results import Judge, Scoreboard
+from popl_rl.results import Judge
 from popl_rl.reward_baselines import Rivals
+from popl_rl.scoreboard import Scoreboard
 from popl_rl.utility_plots import Curves, agreement, majority_figure, utilities
 
 __all__ = ["draw_rewards"]

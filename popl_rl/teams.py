@@ -29,6 +29,7 @@ from popl_rl.policy_set import HypothesisSet, as_set
 from popl_rl.popl import mad, margins
 from popl_rl.population import Population
 from popl_rl.segments import SegmentBank
+from popl_rl.selection import Selection, report
 from popl_rl.variation import inherit_moments
 
 __all__ = ["TeamPOPL", "TeamSettings"]
@@ -93,6 +94,7 @@ class TeamPOPL:
         bank: Segments that the comparisons refer to.
         comparisons: M strict preferences; their cases are not looked at.
         settings: See :class:`TeamSettings`.
+        select: Rule that takes the place of lexicase selection among teams.
         generator: Source of all randomness.
 
     Attributes:
@@ -109,8 +111,10 @@ class TeamPOPL:
         comparisons: Comparisons,
         *,
         settings: TeamSettings,
+        select: Selection | None = None,
         generator: torch.Generator,
     ) -> None:
+        self.select = select
         self.spec, self.bank, self.settings = spec, bank, settings
         self.comparisons, self.generator = comparisons, generator
         self.generation = 0
@@ -166,13 +170,17 @@ class TeamPOPL:
         }
         if settings.first_selection <= self.generation < settings.generations:
             cases = self._bundles(robust)
-            report = lexicase_report(
-                cases, settings.teams, epsilon=mad(cases), generator=self.generator
-            )
-            self._replace(report.parents)
-            metrics["selection_depth"] = float(report.depth.float().mean())
-            metrics["distinct"] = float(report.distinct)
-            metrics["effective_parents"] = report.effective
+            if self.select is None:
+                selected = lexicase_report(
+                    cases, settings.teams, epsilon=mad(cases), generator=self.generator
+                )
+            else:
+                chosen = self.select(cases, settings.teams, generator=self.generator)
+                selected = report(cases, chosen)
+            self._replace(selected.parents)
+            metrics["selection_depth"] = float(selected.depth.float().mean())
+            metrics["distinct"] = float(selected.distinct)
+            metrics["effective_parents"] = selected.effective
         return metrics
 
     def policies(self) -> HypothesisSet:

@@ -167,6 +167,19 @@ def test_results_get_the_name_of_the_method_and_others_come_from_the_first(tmp_p
     assert noisy_popl.scenario not in set(results.scenario), "it is not finished"
 
 
+@pytest.mark.parametrize("label", ["multi_cpl", "em", "vpl"])
+def test_what_a_cell_trained_gets_the_methods_name_whatever_it_is(tmp_path, label):
+    """Its rows are not those of the first cell, and ``cpl`` stays the baseline's."""
+    suite = parse_suite("s", {"methods": {"popl": [], "mine": []}, "scenarios": {"a": []}})
+    first, second = plan(suite, seeds=1)
+    finish(first, tmp_path, [("popl", "g", "accuracy", 0.9), ("cpl", "g", "accuracy", 0.6)])
+    own = [(label, "g", "accuracy", 0.7), (f"{label}_lexicase", "g", "accuracy", 0.5)]
+    finish(second, tmp_path, [*own, ("cpl", "g", "accuracy", 0.1)])
+    results = collect(suite, [first, second], tmp_path)
+    of = results[results.measure == "accuracy"].set_index("method").value.to_dict()
+    assert of == {"popl": 0.9, "cpl": 0.6, "mine": 0.7, "mine_lexicase": 0.5}
+
+
 def test_nothing_is_finished(tmp_path):
     results = collect(SUITE, plan(SUITE, seeds=1), tmp_path)
     assert list(results) == COLUMNS

@@ -71,6 +71,9 @@ CASES = [
         "method__batch_size",
         "method__teams",
         "method__team_generations",
+        "method__tournament",
+        "method__groups",
+        "method__latent",
         "threads",
         "checkpoint_interval",
     ),
@@ -97,6 +100,11 @@ CASES = [
     ("data__segments", 1, "data.segments must be at least 2, to compare, got 1"),
     ("data__load", "/no/such/run/data",
      "data.load must be the folder 'data' of an earlier run, got '/no/such/run/data'"),
+    ("method__algorithm", "sgd",
+     "method.algorithm must be popl, cpl, multi_cpl, em, vpl, got 'sgd'"),
+    ("method__selection", "roulette",
+     "method.selection must be lexicase, tournament, best_sum, random, nsga2, got 'roulette'"),
+    ("method__kl", -0.5, "method.kl must be at least 0, got -0.5"),
     ("method__cases", "group", "method.cases must be rater or preference, got 'group'"),
     ("method__variation", "cosmic",
      "method.variation must be auto, gradient, gaussian, teams, got 'cosmic'"),
@@ -201,6 +209,13 @@ def test_every_choice_fits_its_schema_and_is_valid(choice, config_of):
 def test_an_environment_can_name_raters_of_its_own(config_of):
     assert config_of("env=hidden_utility").raters.groups == ["zeroed", "doubled"]
     assert len(config_of("env=hidden_utility", "raters=cycle").raters.groups) == 3
+
+
+def test_a_scenario_may_say_how_many_groups_a_mixture_is_told_of(config_of):
+    """A suite's overrides of a scenario come before those of a method: values outrank choices."""
+    config = config_of("method.groups=3", "method=em")
+    assert (config.method.algorithm, config.method.groups) == ("em", 3)
+    assert config_of("method=em").method.groups == 2
 
 
 def test_a_method_outranks_an_environment(config_of):

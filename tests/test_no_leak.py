@@ -23,6 +23,10 @@ METHODS = {
         "evolve": "head",
     },
     "teams": {"cases": "preference", "variation": "teams", "teams": 3, "team_generations": 3},
+    "multi_cpl": {"algorithm": "multi_cpl"},
+    "em": {"algorithm": "em"},
+    "vpl": {"algorithm": "vpl"},
+    "nsga2": {"selection": "nsga2"},
 }
 
 

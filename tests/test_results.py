@@ -75,6 +75,15 @@ def test_every_group_finds_its_own_policy(judge, policies, baselines):
         assert best >= catered
 
 
+def test_rows_and_episodes_are_called_as_asked(judge, policies, baselines):
+    board, other = judge.score(policies, baselines), judge.score(policies, baselines, label="em")
+    assert (board.label, other.label) == ("popl", "em")
+    assert set(other.results.method) == {"em", "em_lexicase", "cpl", "oracle", "random"}
+    assert other.results.value.equals(board.results.value)
+    assert ("em", "likes_left") in other.episodes
+    assert other.catered == board.catered
+
+
 def test_the_table_is_complete_and_tidy(judge, policies, baselines):
     results = judge.score(policies, baselines).results
     assert list(results.columns) == ["method", "group", "measure", "value"]

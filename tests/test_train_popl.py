@@ -12,6 +12,7 @@ from popl_rl.policies import PolicySpec
 from popl_rl.policy_set import PolicySet
 from popl_rl.population import Population
 from popl_rl.trainers.train_popl import run, show
+from popl_rl.vpl import EncodedPolicySet
 
 TEAMS = ["method.cases=preference", "method.teams=3", "method.team_generations=2"]
 GYM = ["env=gym", "env.id=CartPole-v1", "raters.label=return", "env.max_steps=30"]
@@ -184,6 +185,34 @@ def test_teams_without_rater_ids(train, capsys):
     assert math.isfinite(result.board.value("popl", "lower", "recovery"))
     show(result)
     assert "upper" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("method", "label", "found"),
+    [
+        ("cpl", "multi_cpl", PolicySet),
+        ("multi_cpl", "multi_cpl", PolicySet),
+        ("em", "em", PolicySet),
+        ("vpl", "vpl", EncodedPolicySet),
+        ("popl_tournament", "popl", PolicySet),
+        ("popl_nsga2", "popl", PolicySet),
+    ],
+)
+def test_methods_to_compare_with(train, method, label, found):
+    result = train(f"method={method}", "evaluation.baseline_steps=2", "evaluation.episodes=4")
+    assert type(result.policies) is found
+    results = result.board.results
+    assert set(results.method) == {label, f"{label}_lexicase", "cpl", "oracle", "random"}
+    assert not results.duplicated(["method", "group", "measure"]).any()
+    metrics = pd.read_csv(result.run_dir / "metrics.csv")
+    assert metrics.generation.tolist() == [1, 2, 3]
+    assert metrics.notna().all(axis=None)
+    assert set(pd.read_csv(result.run_dir / "history.csv").generation) == {1, 3}
+    report = (result.run_dir / "report.md").read_text()
+    assert report.startswith("# POPL: ") == (label == "popl")
+    pictures = {path.stem for path in (result.run_dir / "figures").iterdir()}
+    assert {"learning", "members", "occupancy"} <= pictures
+    assert ("selection" in pictures) == (label == "popl")
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")

@@ -14,12 +14,13 @@ from omegaconf import OmegaConf
 from rich.console import Console
 
 from popl_rl.config import Config, EvaluateConfig, validate
-from popl_rl.experiment import build_groups, build_spec, make_data
+from popl_rl.experiment import build_groups, build_spec, label_of, make_data
 from popl_rl.findings import alarm, findings
 from popl_rl.policy_set import PolicySet, RewardSet, load_set
 from popl_rl.report import markdown, results_table
-from popl_rl.results import Scoreboard, make_judge
+from popl_rl.results import make_judge
 from popl_rl.runs import load_config, save_config, write_atomic
+from popl_rl.scoreboard import Scoreboard
 from popl_rl.trainers.command import register_schemas, run_command
 from popl_rl.worlds import build_world
 
@@ -47,11 +48,10 @@ def run(config: EvaluateConfig) -> tuple[Path, Scoreboard]:
         load=kept if kept.is_dir() else None,
     )
     spec = build_spec(stored.method, world.env)
-    # What it was trained with decides, whatever is asked for now.
-    path = run_dir / "reference"
-    reference = load_set(path) if path.is_dir() else None
-    judge = make_judge(stored, world, groups, data, spec, reference=reference, seed=config.seed)
-    board = judge.score(found, baselines)
+    path = run_dir / "clone"
+    clone = load_set(path) if path.is_dir() else None
+    judge = make_judge(stored, world, groups, data, spec, clone=clone, seed=config.seed)
+    board = judge.score(found, baselines, label=label_of(stored.method))
     number = 1 + len(list((run_dir / "evaluations").glob("[0-9]*")))
     folder = run_dir / "evaluations" / f"{number:03d}"
     beside = folder.with_name(f".{folder.name}")

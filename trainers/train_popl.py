@@ -31,6 +31,7 @@ from popl_rl.experiment import (
     build_spec,
     final_set,
     generations_of,
+    label_of,
     make_data,
     stream,
     train_baselines,
@@ -41,7 +42,7 @@ from popl_rl.loggers import make_logger
 from popl_rl.pictures import draw
 from popl_rl.policy_set import HypothesisSet, as_set
 from popl_rl.report import markdown, results_table
-from popl_rl.results import Scoreboard, make_judge
+from popl_rl.results import make_judge
 from popl_rl.reward_baselines import train_rivals
 from popl_rl.rewards import RewardSpec
 from popl_rl.runs import (
@@ -53,6 +54,7 @@ from popl_rl.runs import (
     write_atomic,
     write_metadata,
 )
+from popl_rl.scoreboard import Scoreboard
 from popl_rl.styles import StyleClone
 from popl_rl.trainer import POPLTrainer
 from popl_rl.trainers.command import register_schemas, run_command
@@ -111,7 +113,7 @@ def run(config: Config) -> Result:
     comparisons = Comparisons.from_preferences(data.preferences, cases=config.method.cases)
     comparisons = comparisons.to(config.device)
     clone: StyleClone | None = None
-    reference = None
+    cloned = None
     if config.method.evolve == "code" or config.evaluation.reference == "clone":
         with Progress("cloning", total=config.method.clone_steps) as progress:
             clone = build_clone(
@@ -122,16 +124,16 @@ def run(config: Config) -> Result:
                 path=run_dir if data.store is None else data.store.parent,
                 progress=progress.update,
             )
-    if clone is not None and config.evaluation.reference == "clone":
-        reference = as_set(typical(clone), alpha=config.method.alpha)
-        _save_anew(reference, run_dir / "reference")
+    if clone is not None:
+        cloned = as_set(typical(clone), alpha=config.method.alpha)
+        _save_anew(cloned, run_dir / "clone")
     if config.method.evolve != "code":
         clone = None
 
     # 3. The population, evolved.
     learner = stream(config.seed, "learner", config.device)
     popl = build_popl(config.method, spec, bank, comparisons, clone=clone, generator=learner)
-    judge = make_judge(config, world, groups, data, spec, reference=reference, seed=config.seed)
+    judge = make_judge(config, world, groups, data, spec, clone=cloned, seed=config.seed)
     metrics = MetricsWriter(run_dir / "metrics.csv")
     history = MetricsWriter(run_dir / "history.csv")
     generations = generations_of(config.method)
@@ -193,7 +195,8 @@ def run(config: Config) -> Result:
             )
 
         # 5. Judged by every hidden group; told in a table, in pictures and in words.
-        board = judge.score(found, baselines, rivals=rivals)
+        label = label_of(config.method)
+        board = judge.score(found, baselines, rivals=rivals, label=label)
         write_atomic(run_dir / "results.csv", board.results.to_csv(index=False))
         figures = draw(
             run_dir, found, baselines, board=board, judge=judge, world=world, rivals=rivals
@@ -210,7 +213,7 @@ def run(config: Config) -> Result:
     }
     text = markdown(
         board.results,
-        title=f"POPL: {config.method.name} in {config.env.factory}",
+        title=f"{'POPL: ' if label == 'popl' else ''}{config.method.name} in {config.env.factory}",
         about=about,
         figures=[Path("figures") / path.name for path in figures.values()],
     )

@@ -1,0 +1,114 @@
+"""The methods that POPL is compared with, from their configuration: pooled CPL, EM and VPL."""
+
+from typing import Any, cast
+
+import torch
+
+from popl_rl.comparisons import Comparisons
+from popl_rl.config import MethodConfig
+from popl_rl.em import EM
+from popl_rl.losses import CPLLoss
+from popl_rl.multi_cpl import MultiCPL
+from popl_rl.policies import PolicySpec
+from popl_rl.population import Population
+from popl_rl.rewards import RewardSpec
+from popl_rl.segments import SegmentBank
+from popl_rl.styled_population import StyledPopulation
+from popl_rl.styles import StyleClone
+from popl_rl.variation import GradientCPL
+from popl_rl.vpl import VPL
+
+__all__ = ["build_alternative"]
+
+
+def build_alternative(
+    config: MethodConfig,
+    spec: PolicySpec | RewardSpec,
+    bank: SegmentBank,
+    comparisons: Comparisons,
+    *,
+    clone: StyleClone | None = None,
+    generator: torch.Generator,
+) -> MultiCPL | EM | VPL:
+    """Build what ``method.algorithm`` names, other than ``popl``.
+
+    ``cpl`` is a single policy. ``em`` is as many mixtures of ``method.groups`` as there is room for
+    among ``method.members``, at least one.
+
+    Args:
+        config: Which, and how it learns.
+        spec: Sizes of the hypotheses.
+        bank: Segments.
+        comparisons: M strict preferences and the case of each.
+        clone: What members are style codes of; they are networks if None.
+        generator: Source of all randomness.
+
+    Raises:
+        ValueError: If VPL is to learn reward functions or style codes.
+    """
+    if config.algorithm == "vpl":
+        if clone is not None:
+            raise ValueError(
+                "method.algorithm=vpl learns networks, not style codes; set method.evolve=all"
+            )
+        return _build_vpl(config, spec, bank, comparisons, generator=generator)
+    members = 1 if config.algorithm == "cpl" else config.members
+    if config.algorithm == "em":
+        members = max(1, members // config.groups) * config.groups
+    if clone is not None:
+        population: Population = StyledPopulation(clone, clone.draw(members, generator=generator))
+    else:
+        evolve = cast("Any", config.evolve)
+        population = Population.create(spec, members, evolve=evolve, generator=generator)
+        population = population.to(bank.row.device)
+    loss = CPLLoss(
+        population,
+        bank,
+        alpha=config.alpha,
+        # Conservatism keeps policies near the data; of reward functions only differences matter.
+        conservatism=config.conservatism if isinstance(spec, PolicySpec) else 1.0,
+        discount=config.discount,
+    )
+    training = GradientCPL(
+        loss,
+        comparisons,
+        generations=config.generations,
+        learning_rate=config.learning_rate,
+        steps=config.steps,
+        batch_size=config.batch_size,
+        generator=generator,
+    )
+    parts = (population, bank, comparisons)
+    if config.algorithm == "em":
+        return EM(*parts, groups=config.groups, training=training, generator=generator)
+    return MultiCPL(*parts, training=training, generator=generator)
+
+
+def _build_vpl(
+    config: MethodConfig,
+    spec: PolicySpec | RewardSpec,
+    bank: SegmentBank,
+    comparisons: Comparisons,
+    *,
+    generator: torch.Generator,
+) -> VPL:
+    if not isinstance(spec, PolicySpec):
+        raise ValueError(
+            "method.algorithm=vpl learns policies, not reward functions; choose another method, or "
+            "set method.learns=policy where there is something to do"
+        )
+    return VPL(
+        spec,
+        bank,
+        comparisons,
+        latent=config.latent,
+        kl=config.kl,
+        generations=config.generations,
+        steps=config.steps,
+        batch_size=config.batch_size,
+        learning_rate=config.learning_rate,
+        alpha=config.alpha,
+        conservatism=config.conservatism,
+        discount=config.discount,
+        generator=generator,
+    )
