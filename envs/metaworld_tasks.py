@@ -5,14 +5,16 @@ Metaworld (Yu et al., 2019, arXiv 1910.10897; McLean et al., 2025, arXiv 2505.11
 
 import os
 import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
 import mujoco
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from popl_rl.envs._metaworld_scripts import Scripted
@@ -37,7 +39,7 @@ __all__ = [
 
 #: Seconds that a step takes: 5 frames of 2.5 ms.
 STEP_SECONDS = 0.0125
-_SPEEDS = (0.25, 0.4, 0.6, 0.8)  # m/s along each axis, for the data
+_SPEEDS = (0.25, 0.4, 0.6, 0.8)
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,7 @@ class MetaworldTask(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         task: Name of the task, with or without "-v3"; underscores will do.
         max_steps: Steps after which an episode is truncated.
         terminate: Whether an episode ends when the task is done.
+        speeds: Speeds of the scripted behaviours that data show, in m/s along each axis.
         render_mode: None or "rgb_array".
         size: Height and width of a rendered frame, in pixels.
         camera: Which of Metaworld's cameras to render.
@@ -113,11 +116,13 @@ class MetaworldTask(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         *,
         max_steps: int = 300,
         terminate: bool = True,
+        speeds: Sequence[float] = _SPEEDS,
         render_mode: str | None = None,
         size: int = 240,
         camera: str = "corner2",
     ) -> None:
         self.task = task_name(task)
+        self.speeds = tuple(speeds)
         if max_steps < 1:
             raise ValueError(f"max_steps must be at least 1, got {max_steps}.")
         if render_mode not in (None, "rgb_array"):
@@ -204,9 +209,52 @@ class MetaworldTask(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         Returns:
             By name ``scripted/<m/s>`` and ``rough/<m/s>``; see :class:`Scripted`.
         """
-        clean = {f"scripted/{v}": Scripted(self.task, speed=v, noise=0.1) for v in _SPEEDS}
-        rough = {f"rough/{v}": Scripted(self.task, speed=v, noise=0.4, push=0.02) for v in _SPEEDS}
+        clean = {f"scripted/{v}": Scripted(self.task, speed=v, noise=0.1) for v in self.speeds}
+        rough = {
+            f"rough/{v}": Scripted(self.task, speed=v, noise=0.4, push=0.02) for v in self.speeds
+        }
         return clean | rough
+
+    def collect_segments(
+        self,
+        num_segments: int,
+        length: int,
+        *,
+        generator: torch.Generator,
+        progress: Callable[[int], None] | None = None,
+    ) -> TensorDict:
+        """Collect segments: from each of many states, one at each of the scripted speeds.
+
+        What can be done from one state, slowly or fast, is what people can compare. See
+        :func:`popl_rl.envs._metaworld_data.collect_continuations`.
+
+        Args:
+            num_segments: Segments to collect, a multiple of the number of speeds.
+            length: Steps of each.
+            generator: Source of all randomness.
+            progress: Called with the number of segments collected so far.
+
+        Raises:
+            ValueError: If the scripted policy rarely does the task, or a number does not fit.
+        """
+        # That module imports this one.
+        from popl_rl.envs._metaworld_data import check_scripted, collect_continuations
+
+        speeds = len(self.speeds)
+        if speeds < 2 or num_segments % speeds:
+            raise ValueError(
+                f"data.segments must be a multiple of the scripted speeds, of which two or more "
+                f"are needed, got {num_segments} segments and {speeds} speeds."
+            )
+        check_scripted(self, episodes=4)
+        return collect_continuations(
+            self,
+            starts=num_segments // speeds,
+            per_start=speeds,
+            length=length,
+            generator=generator,
+            progress=progress,
+        )
 
     def render(self) -> NDArray[np.uint8]:  # type: ignore[override]
         """Return the present picture, ``[size, size, 3]``.
@@ -301,6 +349,7 @@ def metaworld(
     *,
     max_steps: int = 300,
     terminate: bool = True,
+    speeds: Sequence[float] = _SPEEDS,
     render_mode: str | None = None,
     size: int = 240,
     camera: str = "corner2",
@@ -310,6 +359,7 @@ def metaworld(
         task,
         max_steps=max_steps,
         terminate=terminate,
+        speeds=speeds,
         render_mode=render_mode,
         size=size,
         camera=camera,

@@ -13,6 +13,8 @@ from popl_rl.policies import PolicySpec
 from popl_rl.population import Population
 from popl_rl.rewards import RewardSpec
 from popl_rl.segments import SegmentBank
+from popl_rl.styled_population import StyledPopulation
+from popl_rl.styles import StyleClone
 from popl_rl.variation import GradientCPL
 from popl_rl.vpl import VPL
 
@@ -25,6 +27,7 @@ def build_alternative(
     bank: SegmentBank,
     comparisons: Comparisons,
     *,
+    clone: StyleClone | None = None,
     generator: torch.Generator,
 ) -> MultiCPL | EM | VPL:
     """Build what ``method.algorithm`` names, other than ``popl``.
@@ -37,19 +40,28 @@ def build_alternative(
         spec: Sizes of the hypotheses.
         bank: Segments.
         comparisons: M strict preferences and the case of each.
+        clone: What policies are style codes of; they are whole networks if None.
         generator: Source of all randomness.
 
     Raises:
-        ValueError: If VPL is to learn reward functions.
+        ValueError: If VPL is to learn reward functions, or style codes.
     """
     if config.algorithm == "vpl":
+        if clone is not None:
+            raise ValueError(
+                "method.evolve must be all for method.algorithm=vpl, whose z takes the place of a "
+                "style code, got 'code'"
+            )
         return _build_vpl(config, spec, bank, comparisons, generator=generator)
     members = 1 if config.algorithm == "cpl" else config.members
     if config.algorithm == "em":
         members = max(1, members // config.groups) * config.groups
-    population = Population.create(
-        spec, members, evolve=cast("Any", config.evolve), generator=generator
-    ).to(bank.row.device)
+    if clone is not None:
+        population: Population = StyledPopulation(clone, clone.draw(members, generator=generator))
+    else:
+        population = Population.create(
+            spec, members, evolve=cast("Any", config.evolve), generator=generator
+        ).to(bank.row.device)
     loss = CPLLoss(
         population,
         bank,

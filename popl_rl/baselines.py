@@ -51,6 +51,7 @@ def train_cpl(
     alpha: float = 0.5,
     conservatism: float = 0.9,
     discount: float = 1.0,
+    population: Population | None = None,
     generator: torch.Generator,
     progress: Callable[[int], None] | None = None,
 ) -> HypothesisSet:
@@ -70,13 +71,15 @@ def train_cpl(
         alpha: Scale of the scores.
         conservatism: Lambda of the CPL loss.
         discount: Per-step discount of the scores.
+        population: K policies to start from, changed in place; fresh networks if None.
         generator: Source of initial weights and batches.
         progress: Called with the number of steps done.
 
     Returns:
         K policies, in the order of ``weight``.
     """
-    population = Population.create(spec, len(weight), generator=generator).to(weight.device)
+    if population is None:
+        population = Population.create(spec, len(weight), generator=generator).to(weight.device)
     loss = CPLLoss(population, bank, alpha=alpha, conservatism=conservatism, discount=discount)
     optimizer = torch.optim.Adam(population.members.parameters(), lr=learning_rate)
     schedule = linear_decay(optimizer, -(-steps // _BLOCK))

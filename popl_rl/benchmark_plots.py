@@ -13,7 +13,8 @@ from matplotlib.ticker import NullLocator, PercentFormatter
 from numpy.typing import NDArray
 
 from popl_rl.benchmark import worst
-from popl_rl.plots import _LEGEND, PALETTE, _beside, _headline, _tidy
+from popl_rl.plot_style import PALETTE, headline, tidy
+from popl_rl.plots import _LEGEND, _beside
 from popl_rl.report import interval
 from popl_rl.suite import Suite
 
@@ -67,7 +68,7 @@ def scenario_bars(suite: Suite, results: pd.DataFrame) -> Figure:
     methods = suite.ordered(list(table["method"].unique()))
     scenarios = list(table["scenario"].unique())
     fig = Figure(figsize=(max(5.0, len(scenarios) * (0.28 * len(methods) + 0.35)) + 2.4, 4.4))
-    _headline(
+    headline(
         fig,
         "How well is the worst-served group served?",
         "Recovery: (return − random) / (oracle's return − random), cut off below −0.5.\n"
@@ -109,7 +110,7 @@ def scenario_bars(suite: Suite, results: pd.DataFrame) -> Figure:
     ax.set_xticks(range(len(scenarios)), [name.replace("_", "\n", 1) for name in scenarios])
     ax.tick_params(axis="x", length=0)
     fig.legend(loc="outside lower center", ncols=_columns(fig), **_LEGEND)
-    _tidy(ax)
+    tidy(ax)
     return fig
 
 
@@ -145,7 +146,7 @@ def sweep_panels(suite: Suite, results: pd.DataFrame) -> Figure:
     methods = suite.ordered(list(found["method"].unique()))
     styles = _styles(suite, methods)
     fig = Figure(figsize=(max(2.5 * len(drawn) + 0.8, 5.0), 2.1 * len(groups) + 1.8))
-    _headline(
+    headline(
         fig,
         "How well is each group understood?",
         "Solid: by what new raters are given, with 95 % intervals over seeds.\n"
@@ -166,7 +167,7 @@ def sweep_panels(suite: Suite, results: pd.DataFrame) -> Figure:
             ax.xaxis.set_minor_locator(NullLocator())
             ax.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
             ax.axhline(0.5, color=PALETTE["grey"], linewidth=0.8, linestyle=":")
-            _tidy(ax)
+            tidy(ax)
             if column == 0:
                 ax.set_ylabel(f"accuracy on\n“{group}”")
         axes[-1, column].set_xlabel(axis)

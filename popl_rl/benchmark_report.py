@@ -13,7 +13,7 @@ import pandas as pd
 
 from popl_rl.benchmark import Cell, is_finished, worst
 from popl_rl.benchmark_plots import scenario_bars, sweep_panels
-from popl_rl.plots import save
+from popl_rl.plot_style import save
 from popl_rl.report import _table, interval
 from popl_rl.runs import write_atomic
 from popl_rl.suite import Suite

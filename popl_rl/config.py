@@ -46,6 +46,7 @@ class EnvConfig:
     max_steps: int = 60  # steps after which an episode is cut
     success: str = "goal"  # number in info that is positive when the task is done
     door: str | None = None  # integer in info whose values are worth a row in the table
+    measured: list[str] = field(default_factory=list)  # numbers in info whose mean and peak are
 
 
 @dataclass
@@ -80,6 +81,8 @@ class DataConfig:
     memmap: str | None = None  # folder for memory-mapped storage; in memory if null
     load: str | None = None  # folder 'data' of an earlier run: its segments and preferences
     save: bool = True  # keep segments and preferences in the run folder
+    store: str | None = None  # folder in which segments are kept for other runs; none if null
+    seed: int | None = None  # of the segments; that of the run if null
 
 
 @dataclass
@@ -96,7 +99,11 @@ class MethodConfig:
     learns: str = "auto"  # policy, reward; auto: reward where there is nothing to do but judge
     cases: str = "rater"  # what lexicase filters on: rater (needs rater ids) or preference
     variation: str = "auto"  # gradient, gaussian (published), teams; auto goes by the cases
-    evolve: str = "all"  # all: whole networks; head: last layers on a shared, frozen trunk
+    evolve: str = "all"  # all: whole networks; head: last layers on a shared, frozen trunk; code:
+    # style codes fed to a network that was cloned from the data's behaviour and is frozen
+    code_dim: int = 2  # numbers in a style code (code)
+    clone_steps: int = 3000  # gradient steps of behaviour cloning (code)
+    clone_beta: float = 1e-3  # weight of the codes' divergence from their prior (code)
     features: str = "random"  # that trunk: random (published), or pooled: trained on all answers
     members: int = 32  # policies in the population; em: as many mixtures as fit, the best is kept
     generations: int = 100  # others than popl: blocks of method.steps CPL steps
@@ -129,6 +136,8 @@ class EvaluationConfig:
     optimiser: str = "auto"  # how reward functions act: plan, ppo; auto: plan if there is a table
     ppo_frames: int = 100_000  # frames of PPO for each of them
     greedy: bool = False  # most likely actions instead of sampled ones
+    reference: str = "random"  # whose return is a recovery of 0: random actions, or a clone of the
+    # data's typical behaviour, which needs no preferences
     baselines: bool = True  # train pooled CPL and the oracle too
     baselines_from: str | None = None  # folder 'baselines' of a run on the same data; not trained
     reward_baselines: bool = True  # B-REX and DPL too, where items are judged
@@ -139,6 +148,7 @@ class EvaluationConfig:
     baseline_learning_rate: float = 2e-3  # of their Adam
     baseline_alpha: float = 0.5  # scale of their scores
     baseline_conservatism: float = 0.9  # lambda of their CPL loss; 1 for reward functions
+    animate: bool = False  # an animated GIF for each group, where there is a renderer
     history: int = 10  # generations between two snapshots for the pictures; 0 for none
 
 
@@ -217,12 +227,14 @@ def validate(config: Config) -> None:
     at_least_one(evaluation, "evaluation", "baseline_steps", "baseline_batch_size")
     at_least_one(method, "method", "generations", "steps", "batch_size")
     at_least_one(method, "method", "teams", "team_generations", "pooled_steps")
-    at_least_one(method, "method", "specialist_steps", "tournament", "groups", "latent")
+    at_least_one(method, "method", "specialist_steps", "code_dim", "clone_steps")
+    at_least_one(method, "method", "tournament", "groups", "latent")
     expect(method.kl >= 0, "method.kl", "at least 0", method.kl)
     at_least_one(evaluation, "evaluation", "ppo_frames", "brex_steps", "dpl_steps")
     expect(evaluation.menu >= 2, "evaluation.menu", "at least 2, to choose", evaluation.menu)
     for name, value, known in (
         ("evaluation.optimiser", evaluation.optimiser, ("auto", "plan", "ppo")),
+        ("evaluation.reference", evaluation.reference, ("random", "clone")),
         ("method.algorithm", method.algorithm, tuple(ALGORITHMS)),
         ("method.selection", method.selection, _SELECTIONS),
         ("method.learns", method.learns, ("auto", "policy", "reward")),
@@ -252,7 +264,11 @@ def validate(config: Config) -> None:
     )
     kinds = ("auto", "gradient", "gaussian", "teams")
     expect(method.variation in kinds, "method.variation", ", ".join(kinds), method.variation)
-    expect(method.evolve in ("all", "head"), "method.evolve", "all or head", method.evolve)
+    evolved = ("all", "head", "code")
+    expect(method.evolve in evolved, "method.evolve", ", ".join(evolved), method.evolve)
+    if method.evolve == "code":
+        expect(method.learns != "reward", "method.learns", "policy for style codes", method.learns)
+    expect(method.clone_beta >= 0, "method.clone_beta", "at least 0", method.clone_beta)
     if method.variation == "gaussian":
         expect(
             method.evolve == "head", "method.evolve", "head for Gaussian variation", method.evolve

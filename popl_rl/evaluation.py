@@ -19,9 +19,11 @@ __all__ = [
     "group_returns",
     "held_out_pairs",
     "info_rates",
+    "mean_and_peak",
     "new_rater_answers",
     "recovery",
     "roll_out",
+    "steps_to_success",
     "success_rate",
 ]
 
@@ -117,16 +119,45 @@ def success_rate(episodes: TensorDictBase, key: str) -> Tensor:
     return done.any(-1).float().mean(-1)
 
 
-def recovery(value: float, *, random: float, oracle: float) -> float:
-    """``(value - random) / (oracle - random)``: 1 is the oracle's return, 0 a random policy's.
+def steps_to_success(episodes: TensorDictBase, key: str) -> Tensor:
+    """Steps until info ``key`` is positive, mean over the episodes in which it ever is, ``[P]``.
 
-    NaN where the oracle is no better than random, since then nothing was there to recover.
+    NaN without that key, or where it never is.
     """
-    return (value - random) / (oracle - random) if oracle > random else float("nan")
+    if (INFO, key) not in episodes.keys(include_nested=True):
+        return torch.full(episodes.shape[:1], float("nan"))
+    done = (episodes[INFO, key] > 0) & episodes[MASK]
+    steps = 1 + done.float().argmax(-1).float()
+    reached = done.any(-1)
+    mean: Tensor = (steps * reached).sum(-1) / reached.sum(-1)
+    return mean
+
+
+def mean_and_peak(episodes: TensorDictBase, key: str) -> tuple[Tensor, Tensor]:
+    """Mean and greatest value of an info in an episode, each averaged over episodes, ``[P]``."""
+    value, mask = episodes[INFO, key].float(), episodes[MASK]
+    mean = (value * mask).sum(-1) / mask.sum(-1)
+    peak = value.masked_fill(~mask, -torch.inf).amax(-1)
+    return mean.mean(-1), peak.mean(-1)
+
+
+def recovery(value: float, *, reference: float, oracle: float) -> float:
+    """``(value - reference) / (oracle - reference)``: 1 is the oracle's return.
+
+    0 is the return of what one can do without asking anybody: random actions, or a clone of what
+    the data shows. NaN where the oracle is no better than that, since then nothing was there to
+    recover.
+    """
+    return (value - reference) / (oracle - reference) if oracle > reference else float("nan")
 
 
 def held_out_pairs(
-    worth: Tensor, group: int, *, count: int, generator: torch.Generator
+    worth: Tensor,
+    group: int,
+    *,
+    count: int,
+    start: Tensor | None = None,
+    generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
     """Fresh pairs on which a group has a strict opinion, and no rater's noise.
 
@@ -134,12 +165,13 @@ def held_out_pairs(
         worth: Worth of each stored segment to each group, ``[G, N]``.
         group: Which group.
         count: Pairs to draw; those of (nearly) equal worth are dropped.
+        start: Which segments may be compared, ``[N]``; all if None.
         generator: Source of the pairs.
 
     Returns:
         Preferred and other segments, each ``[count or fewer]``.
     """
-    pair = draw_pairs(worth.shape[1], count, generator=generator)
+    pair = draw_pairs(worth.shape[1], count, start=start, generator=generator)
     first, second = worth[group][pair].unbind(-1)
     strict = (first - second).abs() > 1e-6
     swap = (first < second)[strict]
@@ -168,6 +200,7 @@ def new_rater_answers(
     worth: Tensor,
     *,
     answers: int,
+    start: Tensor | None = None,
     generator: torch.Generator,
 ) -> TensorDict:
     """Strict answers of a new rater of one group, noisy as that group's raters are.
@@ -177,6 +210,7 @@ def new_rater_answers(
         group: The new rater's group.
         worth: ``[G, N]``.
         answers: Number of strict answers; ties and skips are asked again.
+        start: Which segments may be compared, ``[N]``; all if None.
         generator: Source of the pairs and of the rater's randomness.
 
     Returns:
@@ -188,7 +222,7 @@ def new_rater_answers(
     person = Raters(tuple(groups), torch.tensor([group]))
     pairs, replies, found = [], [], 0
     for _ in range(100):
-        pair = draw_pairs(worth.shape[1], answers, generator=generator)
+        pair = draw_pairs(worth.shape[1], answers, start=start, generator=generator)
         asked = torch.zeros(answers, dtype=torch.long)
         reply = person.answer(pair, asked, worth, generator=generator)
         strict = reply <= Answer.SECOND

@@ -1,30 +1,20 @@
 """From a configuration to the objects of a run. Configuration objects go no further than here."""
 
-import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 import gymnasium
 import torch
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
-from torchrl.data import TensorDictReplayBuffer
+from tensordict import TensorDictBase
 
 from popl_rl.alternatives import build_alternative
 from popl_rl.baselines import group_weights, train_cpl
 from popl_rl.comparisons import Comparisons
-from popl_rl.config import (
-    ALGORITHMS,
-    DataConfig,
-    EvaluationConfig,
-    MethodConfig,
-    RatersConfig,
-    parse_epsilon,
-)
+from popl_rl.config import ALGORITHMS, EvaluationConfig, MethodConfig, parse_epsilon
+from popl_rl.data import Data, build_groups, fresh_segments, make_data, stream
 from popl_rl.em import EM
-from popl_rl.keys import ACTION, ANSWER, GROUP, INFO, OBSERVATION, Answer
+from popl_rl.keys import ANSWER, GROUP, Answer
 from popl_rl.kinship import seed_with_specialists
 from popl_rl.losses import CPLLoss
 from popl_rl.multi_cpl import MultiCPL
@@ -32,27 +22,22 @@ from popl_rl.policies import PolicySpec, build_network
 from popl_rl.policy_set import HypothesisSet, as_set, load_set
 from popl_rl.popl import POPL
 from popl_rl.population import Population
-from popl_rl.preferences import collect_preferences, load_preferences
-from popl_rl.raters import RaterGroup, Raters, Response, make_groups
 from popl_rl.rewards import RewardSpec, reward_bank
-from popl_rl.segments import (
-    SegmentBank,
-    collect_segments,
-    load_tensordict,
-    save_tensordict,
-    segment_buffer,
-    stored_segments,
-)
+from popl_rl.segments import SegmentBank
 from popl_rl.selection import selection_of
+from popl_rl.store import locked
+from popl_rl.styled_population import StyledPopulation
+from popl_rl.styles import StyleClone, load_clone, save_clone, train_clone
 from popl_rl.teams import TeamPOPL, TeamSettings
 from popl_rl.variation import GaussianHead, GradientCPL
 from popl_rl.vpl import VPL
-from popl_rl.worlds import World, has_nothing_to_do
+from popl_rl.worlds import has_nothing_to_do
 
 __all__ = [
     "Data",
     "Learner",
     "build_bank",
+    "build_clone",
     "build_groups",
     "build_popl",
     "build_spec",
@@ -63,149 +48,12 @@ __all__ = [
     "make_data",
     "stream",
     "train_baselines",
+    "typical",
     "variation_of",
 ]
 
 Learner = POPL | TeamPOPL | MultiCPL | EM | VPL
 """What trains generation by generation, and has a population after each."""
-
-
-def stream(seed: int, name: str, device: torch.device | str = "cpu") -> torch.Generator:
-    """An independent source of randomness for one purpose of a run.
-
-    Each purpose has its own, so that asking for more of one thing changes nothing else.
-    """
-    return torch.Generator(device).manual_seed(zlib.crc32(f"{seed}/{name}".encode()))
-
-
-def build_groups(config: RatersConfig, world: World) -> tuple[RaterGroup, ...]:
-    """Resolve the rater groups.
-
-    Raises:
-        ValueError: If a group cannot be resolved, or regret labels are asked of an environment
-            without a transition table.
-    """
-    response = Response(
-        rationality=config.response.rationality,
-        mistake=config.response.mistake,
-        myopia=config.response.myopia,
-        tie=config.response.tie,
-        skip=config.response.skip,
-    )
-    label = cast("Any", config.label)
-    return make_groups(list(config.groups), label=label, table=world.table, response=response)
-
-
-@dataclass(frozen=True)
-class Data:
-    """What the raters saw and said.
-
-    Attributes:
-        segments: Replay buffer of N segments, one item each.
-        preferences: TensorDict ``[M]``, see :mod:`popl_rl.keys`.
-        worth: Worth of each segment to each group, ``[G, N]``; for evaluation only.
-    """
-
-    segments: TensorDictReplayBuffer
-    preferences: TensorDict
-    worth: Tensor
-
-    @property
-    def steps(self) -> TensorDictBase:
-        """The segments as a TensorDict ``[N, T]``."""
-        return stored_segments(self.segments)
-
-    def save(self, path: Path) -> None:
-        """Write segments and preferences below ``path``, replacing nothing."""
-        for name, data in (("segments", self.steps), ("preferences", self.preferences)):
-            if not (path / name).exists():
-                save_tensordict(data, path / name)
-
-
-def make_data(
-    config: DataConfig,
-    raters: RatersConfig,
-    world: World,
-    groups: tuple[RaterGroup, ...],
-    *,
-    seed: int,
-    max_steps: int,
-    load: Path | None = None,
-    progress: Callable[[int], None] | None = None,
-) -> Data:
-    """Collect segments and ask the raters, or load what an earlier run collected.
-
-    Args:
-        config: Segments to collect.
-        raters: Raters to ask.
-        world: Where segments come from.
-        groups: Rater groups.
-        seed: Seed of the run.
-        max_steps: Steps after which an episode is cut.
-        load: Folder to load from instead.
-        progress: Called with the number of segments collected so far.
-
-    Raises:
-        ValueError: If there is less data than was asked for, or it does not fit the environment.
-    """
-    if load is None:
-        segments = collect_segments(
-            world.make_for_data,
-            world.behaviours,
-            num_segments=config.segments,
-            length=config.length,
-            generator=stream(seed, "segments"),
-            shares=world.shares,
-            max_steps=max_steps,
-            progress=progress,
-        )
-    else:
-        segments = load_tensordict(load / "segments", required={OBSERVATION: 3, ACTION: 2, INFO: 0})
-        if len(segments) < config.segments:
-            raise ValueError(
-                f"data.segments asks for {config.segments} segments, but {load} holds "
-                f"{len(segments)}; ask for fewer or collect more"
-            )
-        expected = world.env.observation_space.shape
-        if segments[OBSERVATION].shape[2:] != expected:
-            raise ValueError(
-                f"{load} holds observations of shape {tuple(segments[OBSERVATION].shape[2:])}, but "
-                f"the environment gives {expected}; it was collected in another environment"
-            )
-        segments.auto_batch_size_(2)
-    memmap = None if config.memmap is None else Path(config.memmap)
-    buffer = segment_buffer(segments, memmap=memmap)
-    worth = torch.stack([group.worth(segments) for group in groups])
-    if load is None:
-        generator = stream(seed, "raters")
-        people = Raters.draw(
-            groups, num_raters=raters.count, shares=raters.shares, generator=generator
-        )
-        preferences = collect_preferences(
-            buffer, people, answers_per_rater=raters.answers, generator=generator
-        )[:].exclude("index")
-    else:
-        preferences = load_preferences(load / "preferences", num_segments=len(segments))
-        group = preferences.get(GROUP, None)
-        if group is not None and int(group.max()) >= len(groups):
-            raise ValueError(
-                f"{load} holds preferences of {int(group.max()) + 1} groups, but raters.groups "
-                f"names {len(groups)}; name the groups that were asked then"
-            )
-    return Data(buffer, preferences, worth)
-
-
-def fresh_segments(config: DataConfig, world: World, *, seed: int, max_steps: int) -> TensorDict:
-    """As many segments as were collected for training, that nobody has seen."""
-    return collect_segments(
-        world.make_for_data,
-        world.behaviours,
-        num_segments=config.segments,
-        length=config.length,
-        generator=stream(seed, "fresh segments"),
-        shares=world.shares,
-        max_steps=max_steps,
-    )
 
 
 def build_spec(config: MethodConfig, env: gymnasium.Env[Any, Any]) -> PolicySpec | RewardSpec:
@@ -230,17 +78,61 @@ def build_bank(segments: TensorDictBase, spec: PolicySpec | RewardSpec) -> Segme
     return SegmentBank.from_segments(segments)
 
 
+def build_clone(
+    config: MethodConfig,
+    spec: PolicySpec | RewardSpec,
+    bank: SegmentBank,
+    *,
+    seed: int,
+    path: Path,
+    progress: Callable[[int], None] | None = None,
+) -> StyleClone:
+    """Train the style clone of a run, or load it if a run on the same segments has trained it.
+
+    Args:
+        config: Length of the codes, and how to train.
+        spec: Sizes of the policies.
+        bank: Segments.
+        seed: Seed of the run.
+        path: Folder to keep it in, one for each seed and configuration.
+        progress: Called with the number of steps done.
+
+    Raises:
+        ValueError: If hypotheses are no policies, or the folder is damaged.
+    """
+    if not isinstance(spec, PolicySpec):
+        raise ValueError("a style clone acts, so method.learns must be policy, got reward")
+    settings = (config.code_dim, config.clone_steps, config.clone_beta, *spec.hidden)
+    path = path / "-".join(map(str, (f"clone-seed{seed}", *settings)))
+    with locked(path):
+        if path.is_dir():
+            return load_clone(spec, path).to(bank.row.device)
+        clone = train_clone(
+            spec,
+            bank,
+            code_dim=config.code_dim,
+            steps=config.clone_steps,
+            beta=config.clone_beta,
+            generator=stream(seed, "clone", bank.row.device),
+            progress=progress,
+        )
+        save_clone(clone, path)
+    return clone
+
+
 def build_popl(
     config: MethodConfig,
     spec: PolicySpec | RewardSpec,
     bank: SegmentBank,
     comparisons: Comparisons,
     *,
+    clone: StyleClone | None = None,
     generator: torch.Generator,
 ) -> Learner:
     """Build the trainer's inner loop; a warmed-up population, nothing selected yet.
 
     ``variation: auto`` means gradient variation for rater cases and teams for preference cases.
+    Members are style codes if ``clone`` is given.
 
     Raises:
         ValueError: If settings do not go together, or a package that they need is missing.
@@ -248,7 +140,7 @@ def build_popl(
     # Conservatism keeps policies near the data; of reward functions only differences matter.
     conservatism = config.conservatism if isinstance(spec, PolicySpec) else 1.0
     if config.algorithm != "popl":
-        return build_alternative(config, spec, bank, comparisons, generator=generator)
+        return build_alternative(config, spec, bank, comparisons, clone=clone, generator=generator)
     select = selection_of(config.selection, tournament=config.tournament)
     if variation_of(config) == "teams":
         settings = TeamSettings(
@@ -262,11 +154,16 @@ def build_popl(
         return TeamPOPL(
             spec, bank, comparisons, settings=settings, select=select, generator=generator
         )
-    networks = [build_network(spec, generator=generator) for _ in range(config.members)]
-    if config.evolve == "head" and config.features == "pooled":
-        networks[0] = _pooled_network(config, spec, bank, comparisons, generator=generator)
-    population = Population(networks, spec, evolve=cast("Any", config.evolve))
-    population = population.to(bank.row.device)
+    if clone is not None:
+        codes = clone.draw(config.members, generator=generator)
+        population: Population = StyledPopulation(clone, codes)
+    else:
+        networks = [build_network(spec, generator=generator) for _ in range(config.members)]
+        if config.evolve == "head" and config.features == "pooled":
+            pooled = _pooled(config, spec, bank, comparisons, generator=generator)
+            networks[0] = pooled.network(0).cpu()
+        population = Population(networks, spec, evolve=cast("Any", config.evolve))
+        population = population.to(bank.row.device)
     kin: torch.Tensor | None = None
     if variation_of(config) == "gaussian":
         variation: GaussianHead | GradientCPL = GaussianHead(
@@ -290,12 +187,13 @@ def build_popl(
             generator=generator,
         )
         if config.kinship and config.cases == "rater":
-            pooled = networks[0]
-            if config.evolve == "all":
-                pooled = _pooled_network(config, spec, bank, comparisons, generator=generator)
+            if config.evolve == "head":
+                single = population.subset([0])
+            else:
+                single = _pooled(config, spec, bank, comparisons, clone=clone, generator=generator)
             kin = seed_with_specialists(
                 population,
-                pooled,
+                single,
                 loss,
                 comparisons,
                 steps=config.specialist_steps,
@@ -318,28 +216,37 @@ def build_popl(
     )
 
 
-def _pooled_network(
+def _pooled(
     config: MethodConfig,
     spec: PolicySpec | RewardSpec,
     bank: SegmentBank,
     comparisons: Comparisons,
     *,
+    clone: StyleClone | None = None,
     generator: torch.Generator,
-) -> torch.nn.Sequential:
-    """A network trained on everybody's answers, whose trunk is worth sharing."""
-    pooled = train_cpl(
+) -> Population:
+    """One member trained on everybody's answers, from which others may start."""
+    # A step on style codes of long segments costs a hundred times what it costs elsewhere.
+    batch_size = 256 if clone is None else config.batch_size
+    return train_cpl(
         spec,
         bank,
         comparisons,
         torch.ones(1, len(comparisons), device=bank.row.device),
         steps=config.pooled_steps,
+        batch_size=batch_size,
         learning_rate=config.learning_rate,
         alpha=config.alpha,
         conservatism=config.conservatism if isinstance(spec, PolicySpec) else 1.0,
         discount=config.discount,
+        population=None if clone is None else typical(clone),
         generator=generator,
-    )
-    return pooled.population.network(0).cpu()
+    ).population
+
+
+def typical(clone: StyleClone, count: int = 1) -> Population:
+    """Copies of the data's typical style: what one can do without asking anybody."""
+    return StyledPopulation(clone, clone.typical().expand(count, -1))
 
 
 def variation_of(config: MethodConfig) -> str:
@@ -376,6 +283,7 @@ def train_baselines(
     preferences: TensorDictBase,
     *,
     num_groups: int,
+    clone: StyleClone | None = None,
     generator: torch.Generator,
     progress: Callable[[int], None] | None = None,
 ) -> HypothesisSet:
@@ -388,6 +296,7 @@ def train_baselines(
         comparisons: The strict ones among ``preferences``.
         preferences: With the hidden groups, which oracles are told.
         num_groups: Number of groups G.
+        clone: What hypotheses are style codes of; they are whole networks if None.
         generator: Source of initial weights and batches.
         progress: Called with the number of steps done.
 
@@ -427,6 +336,7 @@ def train_baselines(
         learning_rate=config.baseline_learning_rate,
         alpha=config.baseline_alpha,
         conservatism=config.baseline_conservatism if isinstance(spec, PolicySpec) else 1.0,
+        population=None if clone is None else typical(clone, len(weight)),
         generator=generator,
         progress=progress,
     )

@@ -8,6 +8,7 @@ Segments, batch size ``[N]`` (N segments of T steps):
 | ``action`` | ``[N, T]`` or ``[N, T, A]`` | int64 or float32 | what was done |
 | ``reward`` | ``[N, T]`` | float32 | the environment's own reward, for raters that use it |
 | ``("info", name)`` | ``[N, T]`` | float32 or int64 | each number of the ``info`` |
+| ``("info", "start")`` | ``[N, T]`` | int64 | which segments may be compared, see :data:`START` |
 
 Preferences, batch size ``[M]``:
 
@@ -34,6 +35,9 @@ RATER = "rater"
 HIDDEN = "hidden"
 GROUP = (HIDDEN, "group")
 UTILITY = (HIDDEN, "utility")
+#: Optional number of the state that a segment goes on from. Where it is given, only segments from
+#: the same state are compared: of two clips that begin alike, what differs is what was done.
+START = (INFO, "start")
 
 SEGMENT_KEYS: tuple[NestedKey, ...] = (OBSERVATION, ACTION, REWARD, INFO)
 #: What a learner may read of a preference.

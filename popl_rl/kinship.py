@@ -2,7 +2,7 @@
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
-from torch import Tensor, nn
+from torch import Tensor
 
 from popl_rl.comparisons import Comparisons
 from popl_rl.lexicase import lexicase_selection
@@ -90,7 +90,7 @@ def kinship(margin: Tensor, comparisons: Comparisons, raters: Tensor) -> Tensor:
 
 def seed_with_specialists(
     population: Population,
-    pooled: nn.Sequential,
+    single: Population,
     loss: CPLLoss,
     comparisons: Comparisons,
     *,
@@ -102,8 +102,8 @@ def seed_with_specialists(
 
     Args:
         population: N members, overwritten.
-        pooled: A network trained on everybody's answers, of which specialists are copies; with the
-            population's trunk, if it has one.
+        single: A population of one, trained on everybody's answers, of which specialists are
+            copies; with the population's trunk, if it has one.
         loss: The loss of that population.
         comparisons: M strict preferences of C raters.
         steps: Gradient steps of each specialist.
@@ -113,7 +113,6 @@ def seed_with_specialists(
     Returns:
         The raters' :func:`kinship`, ``[C, C]``.
     """
-    single = Population([pooled], population.spec, evolve=population.evolve)
     order = torch.randperm(comparisons.num_cases, generator=generator, device=generator.device)
     raters = order[:_MOST]
     found = specialists(

@@ -77,12 +77,14 @@ class _WandbRunLogger(RunLogger):
         self._logger.log_metrics(dict(metrics), step=step)
 
     def log_figures(self, figures: Mapping[str, Figure | Path], step: int) -> None:
-        images = {}
+        images: dict[str, Any] = {}
         for name, figure in figures.items():
             if isinstance(figure, Figure):
                 png = io.BytesIO()
                 figure.savefig(png, format="png")
                 images[f"figures/{name}"] = self._wandb.Image(Image.open(png))
+            elif figure.suffix == ".gif":
+                images[f"figures/{name}"] = self._wandb.Video(str(figure), format="gif")
             else:
                 images[f"figures/{name}"] = self._wandb.Image(str(figure))
         self._logger.experiment.log({**images, "figures/step": step})

@@ -183,4 +183,5 @@ def descend(
         optimizer.zero_grad(set_to_none=True)
         value.backward()
         optimizer.step()
+        loss.population.constrain_()
     return float(value.detach()) / count

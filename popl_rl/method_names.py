@@ -20,6 +20,7 @@ METHODS = {
     "dpl_categorical": "DPL, categorical",
     "dpl_categorical_risk_averse": "DPL, categorical, risk-averse",
     "oracle": "oracle (told the groups)",
+    "clone": "clone of the data",
     "random": "random actions",
 }
 """Names to print for the methods of a results table, in the order to show them in."""

@@ -1,5 +1,6 @@
 """The pictures of a run, drawn from its files and its scoreboard."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ from tensordict import TensorDictBase
 
 from popl_rl import plots
 from popl_rl.keys import INFO
+from popl_rl.motion_pictures import animate, draw_motion
+from popl_rl.plot_style import save
 from popl_rl.policy_set import HypothesisSet
 from popl_rl.results import Judge, Scoreboard
 from popl_rl.reward_baselines import Rivals
@@ -109,11 +112,18 @@ def draw(
             caption="Each rater group gets its own policy from the set; pooled CPL is one policy "
             "for everybody.",
         )
+    figures |= draw_motion(found, board=board, judge=judge)
     figures |= draw_rewards(found, baselines, board=board, judge=judge, rivals=rivals)
     paths = {}
     for name, figure in figures.items():
         paths[name] = folder / f"{name}.png"
-        plots.save(figure, paths[name])
+        save(figure, paths[name])
+    if judge.config.animate:
+        try:
+            paths |= animate(folder, found, board=board, world=world, seed=judge.seed)
+        except RuntimeError as error:
+            # Pictures that need a renderer are no reason to lose a run that is done.
+            warnings.warn(f"no animations were made: {error}", stacklevel=2)
     return paths
 
 

@@ -3,12 +3,10 @@
 Everything is drawn with Matplotlib's objects and nothing with pyplot: no global state, no windows.
 """
 
-import io
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,32 +20,18 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from numpy.typing import ArrayLike, NDArray
 
 from popl_rl.method_names import METHODS, method_name
-from popl_rl.runs import write_atomic
+from popl_rl.plot_style import PALETTE, headline, tidy
 
 __all__ = [
     "METHODS",
-    "PALETTE",
     "learning_curves",
     "members",
     "method_name",
     "occupancy",
     "recovery_bars",
     "require_columns",
-    "save",
     "selection",
 ]
-
-PALETTE = {
-    "blue": "#0072B2",
-    "orange": "#E69F00",
-    "green": "#009E73",
-    "purple": "#CC79A7",
-    "vermilion": "#D55E00",
-    "sky": "#56B4E9",
-    "black": "#000000",
-    "grey": "#767676",
-}
-"""Colours that stay apart for colour-blind readers (Okabe and Ito, 2008), and a grey."""
 
 _METHOD_COLOURS = {
     "popl": PALETTE["blue"],
@@ -62,13 +46,6 @@ _METHOD_COLOURS = {
 _OTHERS = (PALETTE["green"], PALETTE["purple"], PALETTE["vermilion"])
 _COLOURS = tuple(PALETTE[name] for name in ("blue", "vermilion", "green", "purple", "sky"))
 _LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 9}
-
-
-def save(fig: Figure, path: Path) -> None:
-    """Write a figure as a PNG of 120 dots per inch, whole or not at all."""
-    png = io.BytesIO()
-    fig.savefig(png, format="png", dpi=120)
-    write_atomic(path, png.getvalue())
 
 
 def occupancy(
@@ -105,7 +82,7 @@ def occupancy(
     columns = math.ceil(len(shares) / lines)
     width = max(2.9 * columns + 0.9, 4.5)
     fig = Figure(figsize=(width, lines * (2.7 * max(rows / cols, 0.4) + 0.3) + 1.0))
-    _headline(fig, suptitle, caption)
+    headline(fig, suptitle, caption)
     axes = fig.subplots(lines, columns, squeeze=False)
     # Most steps fall on few cells; the root keeps the way there visible.
     norm = PowerNorm(0.5, vmin=0, vmax=max(share.max() for share in shares.values()) or 1)
@@ -190,7 +167,7 @@ def members(
     size = 5.0 if len(pairs) == 1 else 3.0
     width = size * columns + 1.6
     fig = Figure(figsize=(width, (size - 0.35) * lines + 1.7))
-    _headline(
+    headline(
         fig,
         "Does every group find a policy of its own?",
         "Each dot is a member of the population: how often it ranks unseen pairs as a group does.\n"
@@ -224,7 +201,7 @@ def members(
         _corner(ax, "suits both", 0.98, "right")
         for axis in (ax.xaxis, ax.yaxis):
             axis.set_major_formatter(PercentFormatter(1, decimals=0))
-        _tidy(ax)
+        tidy(ax)
     if len(generations) > 1:
         ticks = MaxNLocator(5, integer=True)
         bar = fig.colorbar(ScalarMappable(norm, colours), ax=axes, shrink=0.6, ticks=ticks)
@@ -294,7 +271,7 @@ def learning_curves(metrics: pd.DataFrame) -> Figure:
     require_columns(metrics, ["generation", "worst_rater_accuracy", "mean_accuracy"])
     with_loss = "loss_cpl" in metrics and metrics["loss_cpl"].notna().any()
     fig = Figure(figsize=(7.5, 5.6 if with_loss else 3.8))
-    _headline(
+    headline(
         fig,
         "Is anybody left out?",
         "Blue: every rater (or answer) is judged by the member that suits it best, and this is the "
@@ -327,7 +304,7 @@ def selection(metrics: pd.DataFrame) -> Figure:
     """
     require_columns(metrics, ["generation", "selection_depth", "distinct", "effective_parents"])
     fig = Figure(figsize=(7.5, 5.2))
-    _headline(
+    headline(
         fig,
         "Does selection keep many members alive?",
         "Effective parents: as many equally frequent parents would be as diverse.",
@@ -368,7 +345,7 @@ def recovery_bars(results: pd.DataFrame) -> Figure:
     low = -0.5 if rows["value"].min() < 0 else 0.0
     high = 1.25
     fig = Figure(figsize=(max(4.0, len(groups) * (0.5 * len(methods) + 0.4)) + 2.6, 4.2))
-    _headline(
+    headline(
         fig,
         "How well is each group served?",
         "Recovery: (return − random) / (oracle's return − random), in the group's own utility.",
@@ -400,7 +377,7 @@ def recovery_bars(results: pd.DataFrame) -> Figure:
     ax.tick_params(axis="x", length=0)
     ax.set(xlabel="raters who want", ylabel="recovery", ylim=(low and low - 0.2, high + 0.15))
     fig.legend(loc="outside lower center", ncols=min(len(methods), 3), **_LEGEND)
-    _tidy(ax)
+    tidy(ax)
     return fig
 
 
@@ -435,11 +412,7 @@ def _line(ax: Axes, metrics: pd.DataFrame, column: str, label: str, colour: str)
     if len(rows):
         _beside(ax, label, rows[column].iloc[-1], PALETTE[colour])
     ax.xaxis.set_major_locator(MaxNLocator(7, steps=[1, 2, 5, 10], integer=True, min_n_ticks=1))
-    _tidy(ax)
-
-
-def _tidy(ax: Axes) -> None:
-    ax.spines[["top", "right"]].set_visible(False)
+    tidy(ax)
 
 
 def _beside(ax: Axes, text: str, height: float, colour: str) -> None:
@@ -454,23 +427,6 @@ def _beside(ax: Axes, text: str, height: float, colour: str) -> None:
         fontsize=9,
         color=colour,
     )
-
-
-def _headline(fig: Figure, title: str, subtitle: str) -> None:
-    """Write title and subtitle at the upper left, and keep the room below for the axes."""
-    inch = 1 / fig.get_figheight()
-    fig.text(0.1 / fig.get_figwidth(), 1 - 0.08 * inch, title, va="top", fontsize=13, weight="bold")
-    fig.text(
-        0.1 / fig.get_figwidth(),
-        1 - 0.36 * inch,
-        subtitle,
-        va="top",
-        fontsize=9,
-        color=PALETTE["grey"],
-    )
-    lines = 1 + subtitle.count("\n")
-    room = (0.4 + 0.17 * lines) * inch
-    fig.set_layout_engine("constrained", rect=(0, 0, 1, 1 - room))
 
 
 def require_columns(table: pd.DataFrame, columns: Sequence[str]) -> None:

@@ -182,7 +182,7 @@ class HypothesisSet:
         try:
             whole = beside / "set"
             whole.mkdir()
-            population = self.population
+            population = self.population.plain()
             save_tensordict(population.members.data, whole / "members")
             trunk = {name: value.tolist() for name, value in population.trunk.state_dict().items()}
             about = {

@@ -12,14 +12,15 @@ from popl_rl.policies import Spec, build_network
 from popl_rl.rewards import RewardSpec
 from popl_rl.segments import SegmentBank
 
-__all__ = ["Population", "segment_scores"]
+__all__ = ["Layer", "Population", "activation", "segment_scores"]
 
 # A CPU core multiplies fastest what stays in its cache from one layer to the next.
 _ROWS = 1024  # observations looked at together
 _BLOCK = 2**18  # outputs of a layer, over these observations and some members
 
-#: Weight and bias of a linear layer of every member, or what comes between two of them.
-_Layer = tuple[Tensor, Tensor | None] | nn.Module
+#: Weight and bias of a linear layer, or what comes between two of them. Weights are ``[N, K, F]``,
+#: or ``[K, F]`` where all members share one; biases ``[N, K]``, or ``[K]`` likewise.
+Layer = tuple[Tensor, Tensor | None] | nn.Module
 
 
 class Population(nn.Module):
@@ -51,6 +52,7 @@ class Population(nn.Module):
         evolve: Literal["all", "head"] = "all",
     ) -> None:
         super().__init__()
+        self.evolve: Literal["all", "head", "code"]
         if not networks:
             raise ValueError("networks must hold at least one network, got none")
         kinds = {str(network) for network in networks}
@@ -68,7 +70,7 @@ class Population(nn.Module):
         # Sequential(*...) rather than a slice: it numbers the layers from 0.
         own = [nn.Sequential(*list(network)[split:]) for network in networks]
         self.members: TensorDictParams = TensorDict.from_modules(*own, as_module=True)
-        self._activations = [_activation(layer) for layer in list(networks[0])[split:]]
+        self._activations = [activation(layer) for layer in list(networks[0])[split:]]
         self._seen = _Seen()
 
     @classmethod
@@ -110,8 +112,8 @@ class Population(nn.Module):
         """The members' own layers, applied to outputs of the trunk ``[R, F]`` or ``[N, R, F]``."""
         return _apply(self._layers(), features)
 
-    def _layers(self) -> list[_Layer]:
-        layers: list[_Layer] = []
+    def _layers(self) -> list[Layer]:
+        layers: list[Layer] = []
         for position, activation in enumerate(self._activations):
             if activation is not None:
                 layers.append(activation)
@@ -119,6 +121,9 @@ class Population(nn.Module):
             layer = self.members[str(position)]
             layers.append((layer["weight"], layer.get("bias", None)))
         return layers
+
+    def constrain_(self) -> None:
+        """Put members that a step led out of bounds back, in place; whole networks have none."""
 
     @torch.no_grad()
     def replace_(self, parents: Tensor) -> None:
@@ -140,23 +145,32 @@ class Population(nn.Module):
 
     def network(self, index: int) -> nn.Sequential:
         """Member ``index`` as an ordinary network with parameters of its own."""
-        generator = torch.Generator().manual_seed(0)
-        network = build_network(self.spec, generator=generator).to(self.device)
+        network = self._blank_network()
         split = len(self.trunk)
         network[:split].load_state_dict(self.trunk.state_dict())
         own = self.members.data[index].flatten_keys(".").to_dict()
         nn.Sequential(*list(network)[split:]).load_state_dict(own)
         return network
 
+    def plain(self) -> "Population":
+        """The same members as whole networks, or as heads on the same trunk: what can be saved."""
+        return self
 
-def _activation(layer: nn.Module) -> nn.Module | None:
+    def _blank_network(self) -> nn.Sequential:
+        """A network of the members' architecture, whose weights say nothing yet."""
+        generator = torch.Generator().manual_seed(0)
+        return build_network(self.spec, generator=generator).to(self.device)
+
+
+def activation(layer: nn.Module) -> nn.Module | None:
+    """A layer's activation, or None for a linear layer."""
     if isinstance(layer, nn.Linear):
         return None
     # It follows a linear layer, whose output nobody else needs.
     return nn.ReLU(inplace=True) if isinstance(layer, nn.ReLU) else layer
 
 
-def _apply(layers: Sequence[_Layer], features: Tensor) -> Tensor:
+def _apply(layers: Sequence[Layer], features: Tensor) -> Tensor:
     """Own layers of N members on features ``[R, F]`` or ``[N, R, F]``, ``[N, R, K]``."""
     hidden = features
     for layer in layers:
@@ -164,6 +178,12 @@ def _apply(layers: Sequence[_Layer], features: Tensor) -> Tensor:
             hidden = layer(hidden)
             continue
         weight, bias = layer
+        if weight.ndim == 2:
+            if bias is None or bias.ndim == 1:
+                hidden = F.linear(hidden, weight, bias)
+            else:
+                hidden = F.linear(hidden, weight) + bias.unsqueeze(1)
+            continue
         count = len(weight)
         if hidden.ndim == 2 and len(layers) == 1:
             # Heads on features they share: one product with all of them below each other.
@@ -229,9 +249,9 @@ def _chunks(total: int, size: int) -> Iterator[slice]:
         yield slice(start, min(start + size, total))
 
 
-def _each(layers: Sequence[_Layer], change: Callable[[Tensor], Tensor]) -> list[_Layer]:
+def _each(layers: Sequence[Layer], change: Callable[[Tensor], Tensor]) -> list[Layer]:
     """The same layers with other weights and biases."""
-    changed: list[_Layer] = []
+    changed: list[Layer] = []
     for layer in layers:
         if isinstance(layer, nn.Module):
             changed.append(layer)
@@ -241,8 +261,17 @@ def _each(layers: Sequence[_Layer], change: Callable[[Tensor], Tensor]) -> list[
     return changed
 
 
-def _some(layers: Sequence[_Layer], part: slice) -> list[_Layer]:
-    return _each(layers, lambda tensor: tensor[part])
+def _some(layers: Sequence[Layer], part: slice) -> list[Layer]:
+    """The layers of some members; what all members share stays as it is."""
+    chosen: list[Layer] = []
+    for layer in layers:
+        if isinstance(layer, nn.Module):
+            chosen.append(layer)
+        else:
+            weight, bias = layer
+            own = weight[part] if weight.ndim == 3 else weight
+            chosen.append((own, bias[part] if bias is not None and bias.ndim == 2 else bias))
+    return chosen
 
 
 @torch.no_grad()

@@ -8,11 +8,17 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Transform
 
-from popl_rl.keys import ANSWER, GROUP, PAIR, RATER, UTILITY, Answer
+from popl_rl.keys import ANSWER, GROUP, PAIR, RATER, START, UTILITY, Answer
 from popl_rl.raters import Raters
 from popl_rl.segments import load_tensordict, stored_segments
 
-__all__ = ["PreferenceCollector", "collect_preferences", "draw_pairs", "load_preferences"]
+__all__ = [
+    "PreferenceCollector",
+    "collect_preferences",
+    "draw_pairs",
+    "load_preferences",
+    "starts_of",
+]
 
 
 class PreferenceCollector(Transform):
@@ -20,7 +26,8 @@ class PreferenceCollector(Transform):
 
     Append it to the buffer that keeps preferences and extend that buffer with queries: a
     TensorDict ``[M]`` with ``rater`` (whom to ask) and, if you choose the queries yourself,
-    ``pair``. Pairs that are not given are drawn uniformly from the stored segments. What is
+    ``pair``. Pairs that are not given are drawn uniformly from the stored segments: where these say
+    which state they go on from (:data:`~popl_rl.keys.START`), from those of one state. What is
     written is the query with ``answer`` and, for evaluation only, ``("hidden", "group")`` and
     ``("hidden", "utility")``.
 
@@ -55,7 +62,9 @@ class PreferenceCollector(Transform):
         self.raters = raters
         self.generator = generator
         #: Worth of each segment to each group, ``[G, N]``.
-        self.worth: Tensor = raters.worth(stored_segments(segments))
+        steps = stored_segments(segments)
+        self.worth: Tensor = raters.worth(steps)
+        self.start = starts_of(steps)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         rater = tensordict[RATER]
@@ -65,7 +74,9 @@ class PreferenceCollector(Transform):
             )
         pair = tensordict.get(PAIR, None)
         if pair is None:
-            pair = draw_pairs(len(self.segments), len(rater), generator=self.generator)
+            pair = draw_pairs(
+                len(self.segments), len(rater), start=self.start, generator=self.generator
+            )
         elif not ((pair >= 0) & (pair < len(self.segments))).all():
             raise ValueError(
                 f"pair must be segments in 0..{len(self.segments) - 1}, got {pair.min()}.."
@@ -83,12 +94,55 @@ class PreferenceCollector(Transform):
         return tensordict
 
 
-def draw_pairs(num_segments: int, num_pairs: int, *, generator: torch.Generator) -> Tensor:
-    """Uniform pairs of two different segments, ``[num_pairs, 2]``."""
-    first = torch.randint(num_segments, (num_pairs,), generator=generator)
-    # A shift of 1..N-1 never lands on the first segment again.
-    shift = torch.randint(1, num_segments, (num_pairs,), generator=generator)
-    return torch.stack([first, (first + shift) % num_segments], -1)
+def starts_of(segments: TensorDictBase) -> Tensor | None:
+    """Which segments may be compared with each other, ``[N]``; None if all of them.
+
+    Args:
+        segments: TensorDict ``[N, T]``.
+    """
+    start = segments.get(START, None)
+    return None if start is None else start[:, 0].long()
+
+
+def draw_pairs(
+    num_segments: int,
+    num_pairs: int,
+    *,
+    start: Tensor | None = None,
+    generator: torch.Generator,
+) -> Tensor:
+    """Uniform pairs of two different segments, ``[num_pairs, 2]``.
+
+    Args:
+        num_segments: Number of segments N.
+        num_pairs: Pairs to draw.
+        start: Segments with the same number may be compared, ``[N]``; all if None.
+        generator: Source of the pairs.
+
+    Raises:
+        ValueError: If some segment shares its start with no other.
+    """
+    if start is None:
+        first = torch.randint(num_segments, (num_pairs,), generator=generator)
+        # A shift of 1..N-1 never lands on the first segment again.
+        shift = torch.randint(1, num_segments, (num_pairs,), generator=generator)
+        return torch.stack([first, (first + shift) % num_segments], -1)
+    # Segments in the order of their starts, each start a run of some length.
+    order = start.argsort(stable=True)
+    lengths = start[order].unique_consecutive(return_counts=True)[1]
+    if int(lengths.min()) < 2:
+        raise ValueError(
+            f"every start must be shared by two segments or more, to compare them, but "
+            f"{int((lengths < 2).sum())} of {len(lengths)} starts have a single one; collect more "
+            "segments from each start"
+        )
+    begins = lengths.cumsum(0) - lengths
+    begin, length = (each.repeat_interleave(lengths) for each in (begins, lengths))
+    place = torch.randint(num_segments, (num_pairs,), generator=generator)
+    chance = torch.rand(num_pairs, generator=generator, dtype=torch.double)
+    ahead = 1 + (chance * (length[place] - 1)).long()
+    other = begin[place] + (place - begin[place] + ahead) % length[place]
+    return torch.stack([order[place], order[other]], -1)
 
 
 def collect_preferences(

@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from popl_rl import planning, registry
-from popl_rl.keys import ACTION, INFO, Answer
+from popl_rl.keys import ACTION, INFO, OBSERVATION, Answer
 
 __all__ = ["Label", "RaterGroup", "Raters", "Response", "Utility", "make_groups"]
 
@@ -117,11 +117,13 @@ class RaterGroup:
         response: How its people answer.
         label: "return" compares sums of utility; "regret" compares sums of optimal advantages, the
             assumption that CPL (arXiv 2310.13639) is derived from.
-        advantages: ``[S, A]`` optimal advantages of the utility, for label="regret"; None for
-            "return".
+        advantages: ``[S, A]`` optimal advantages of the utility, for label="regret" where the
+            environment has a transition table.
+        value: What a state is worth, observations ``[..., O]`` -> ``[...]``, for label="regret"
+            elsewhere; see :func:`popl_rl.values.with_values`. None for "return", as ``advantages``.
 
     Raises:
-        ValueError: If ``label`` is neither, or ``advantages`` does not go with it.
+        ValueError: If ``label`` is neither, or ``advantages`` and ``value`` do not go with it.
     """
 
     name: str
@@ -129,16 +131,18 @@ class RaterGroup:
     response: Response
     label: Label = "return"
     advantages: Tensor | None = None
+    value: Callable[[Tensor], Tensor] | None = None
 
     def __post_init__(self) -> None:
         if self.label not in ("regret", "return"):
             raise ValueError(f"label must be 'regret' or 'return', got {self.label!r}.")
-        if (self.label == "regret") != (self.advantages is not None):
+        given = [name for name in ("advantages", "value") if getattr(self, name) is not None]
+        if len(given) != (self.label == "regret"):
             raise ValueError(
-                f"rater {self.name!r}: label='regret' needs advantages [states, actions] and "
-                f"label='return' none, got label={self.label!r} with "
-                f"{'no advantages' if self.advantages is None else 'advantages'}; make_groups() "
-                "computes them from a transition table."
+                f"rater {self.name!r}: label='regret' needs either advantages [states, actions] or "
+                f"the value of a state, and label='return' none of them, got label={self.label!r} "
+                f"with {' and '.join(given) or 'no advantages'}; make_groups() computes advantages "
+                "from a transition table, with_values() fits values to segments."
             )
 
     def step_utility(self, segments: TensorDictBase) -> Tensor:
@@ -183,15 +187,21 @@ class RaterGroup:
     def judge(self, segments: TensorDictBase) -> Tensor:
         """Return the worth of each step by which this group compares, float ``[N, T]``.
 
-        That is its utility (label="return") or the optimal advantage of the action taken
-        (label="regret", for which segments must hold ``("info", "state")`` and a discrete
-        ``action``).
+        That is its utility (label="return") or the advantage of the action taken
+        (label="regret"). With a table of optimal advantages, segments must hold ``("info",
+        "state")`` and a discrete ``action``. With the value V of a state it is
+        ``u_t + V(s_{t+1}) - V(s_t)``, and 0 for the last step, after which no state is known: in
+        sum ``sum u + V(s_T) - V(s_0)``.
 
         Raises:
             ValueError: As :meth:`step_utility`, or if segments do not say which state each step was
                 taken in.
             TypeError: As :meth:`step_utility`.
         """
+        if self.value is not None:
+            worth = self.value(segments[OBSERVATION])
+            gained = self.step_utility(segments)[:, :-1] + worth.diff(dim=1)
+            return torch.nn.functional.pad(gained, (0, 1))
         if self.advantages is None:
             return self.step_utility(segments)
         if (INFO, "state") not in segments.keys(include_nested=True):

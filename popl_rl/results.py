@@ -15,14 +15,17 @@ from popl_rl.evaluation import (
     group_returns,
     held_out_pairs,
     info_rates,
+    mean_and_peak,
     new_rater_answers,
     recovery,
+    steps_to_success,
     success_rate,
 )
 from popl_rl.experiment import Data, build_bank, fresh_segments, stream
 from popl_rl.policies import PolicySpec
 from popl_rl.policy_set import HypothesisSet, PolicySet
 from popl_rl.population import segment_scores
+from popl_rl.preferences import starts_of
 from popl_rl.raters import RaterGroup
 from popl_rl.reward_baselines import Rivals
 from popl_rl.rewards import RewardSpec
@@ -65,6 +68,8 @@ class Judge:
         groups: G groups.
         bank: Segments to judge on.
         worth: Worth of each segment to each group, ``[G, N]``.
+        start: Which segments may be compared, ``[N]``; all if None.
+        reference: A policy whose return is a recovery of 0; random actions if None.
         seed: Seed of the run.
     """
 
@@ -77,14 +82,19 @@ class Judge:
         bank: SegmentBank,
         worth: Tensor,
         *,
+        start: Tensor | None = None,
+        reference: HypothesisSet | None = None,
         seed: int,
     ) -> None:
         self.acting, self.env, self.config = acting, env, config
         self.groups, self.bank, self.worth = groups, bank, worth
+        self.start, self.reference = start, reference
         self.seed = seed
         generator = stream(seed, "held-out pairs")
         self.pairs = {
-            index: held_out_pairs(worth, index, count=config.pairs, generator=generator)
+            index: held_out_pairs(
+                worth, index, count=config.pairs, start=start, generator=generator
+            )
             for index in range(len(groups))
         }
 
@@ -117,6 +127,7 @@ class Judge:
                     index,
                     self.worth,
                     answers=self.config.answers,
+                    start=self.start,
                     generator=generator,
                 )
                 choice = hypotheses.cater(
@@ -148,7 +159,8 @@ class Judge:
         random = self.acting(None)
         base = None if baselines is None else self.acting(baselines)
         oracle = None if base is None else group_returns(base[1:], self.groups).diagonal()
-        rows = _Rows(self.groups, self.env, random=random, oracle=oracle)
+        reference = random if self.reference is None else self.acting(self.reference)
+        rows = _Rows(self.groups, self.env, reference=reference, oracle=oracle)
         catered: dict[str, int] = {}
         episodes: dict[tuple[str, str], TensorDict] = {}
         sets = {label: hypotheses} | ({} if rivals is None else {"brex": rivals.brex})
@@ -180,6 +192,8 @@ class Judge:
         if rivals is not None:
             self._score_distributional(rivals, rows)
         for index in range(len(self.groups)):
+            if self.reference is not None:
+                rows.add("clone", index, reference, torch.ones(1))
             rows.add("random", index, random, torch.ones(1))
         results = pd.DataFrame(rows.rows, columns=["method", "group", "measure", "value"])
         return Scoreboard(results, catered, episodes, label)
@@ -205,23 +219,29 @@ class _Rows:
         groups: Sequence[RaterGroup],
         env: EnvConfig,
         *,
-        random: TensorDict,
+        reference: TensorDict,
         oracle: Tensor | None,
     ) -> None:
         self.groups, self.env = groups, env
-        self.random = group_returns(random, groups)[0]
-        self.oracle = torch.full_like(self.random, float("nan")) if oracle is None else oracle
+        self.reference = group_returns(reference, groups)[0]
+        self.oracle = torch.full_like(self.reference, float("nan")) if oracle is None else oracle
         self.rows: list[tuple[str, str, str, float]] = []
 
     def add(self, method: str, index: int, rolled: TensorDict, share: Tensor) -> None:
         """What a method does for one group: policies ``[P, E, H]``, weighted by ``share``."""
         group = self.groups[index].name
         value = float(group_returns(rolled, self.groups)[:, index] @ share)
-        low, high = float(self.random[index]), float(self.oracle[index])
+        low, high = float(self.reference[index]), float(self.oracle[index])
         self.rows.append((method, group, "return", value))
-        self.rows.append((method, group, "recovery", recovery(value, random=low, oracle=high)))
+        self.rows.append((method, group, "recovery", recovery(value, reference=low, oracle=high)))
         success = float(success_rate(rolled, self.env.success) @ share)
         self.rows.append((method, group, "success", success))
+        if self.env.measured:
+            steps = float(steps_to_success(rolled, self.env.success) @ share)
+            self.rows.append((method, group, "steps", steps))
+        for name in self.env.measured:
+            for what, values in zip(("mean", "peak"), mean_and_peak(rolled, name), strict=True):
+                self.rows.append((method, group, f"{what}_{name}", float(values @ share)))
         if self.env.door is not None:
             for door, rate in info_rates(rolled, self.env.door).items():
                 if door >= 0:
@@ -242,6 +262,7 @@ def make_judge(
     data: Data,
     spec: PolicySpec | RewardSpec,
     *,
+    reference: HypothesisSet | None = None,
     seed: int,
 ) -> Judge:
     """The judge that fits what is learnt and where.
@@ -249,12 +270,21 @@ def make_judge(
     Policies are rolled out. Reward functions are planned for or optimised by PPO, and rolled out;
     where there is nothing to do they choose from menus of fresh segments.
 
+    Args:
+        config: The run's configuration.
+        world: Where policies act.
+        groups: G groups.
+        data: Segments, and their worth.
+        spec: Sizes of the hypotheses.
+        reference: A policy whose return is a recovery of 0; random actions if None.
+        seed: Seed of the evaluation.
+
     Raises:
         ValueError: If planning is asked for without a transition table.
     """
     device, options = config.device, config.evaluation
     if has_nothing_to_do(world.env):
-        segments = fresh_segments(config.data, world, seed=seed, max_steps=config.env.max_steps)
+        segments = fresh_segments(config.data, world, seed=seed, env=config.env)
         bank = build_bank(segments, spec).to(device)
         worth = torch.stack([group.worth(segments) for group in groups])
         chooser = Choosing(segments, bank, options, seed=seed)
@@ -267,4 +297,14 @@ def make_judge(
             acting = Planning(world, config.env, options, seed=seed)
         else:
             acting = Optimising(world, config.env, options, seed=seed, bank=bank)
-    return Judge(acting, config.env, options, groups, bank, data.worth, seed=seed)
+    return Judge(
+        acting,
+        config.env,
+        options,
+        groups,
+        bank,
+        data.worth,
+        start=starts_of(data.steps),
+        reference=reference,
+        seed=seed,
+    )

@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from popl_rl.likeness import Array, alike, checked_table, order_by_likeness, rank_shares
 from popl_rl.majority import find_cycle
-from popl_rl.plots import _COLOURS, _LEGEND, PALETTE, _headline, _tidy
+from popl_rl.plot_style import PALETTE, headline, tidy
+from popl_rl.plots import _COLOURS, _LEGEND
 
 __all__ = ["Curves", "agreement", "majority_figure", "utilities"]
 
@@ -77,7 +78,7 @@ def utilities(
     # Names of what else there may be to explain are shorter.
     across, deep = _legend_shape(2 * len(true) + 3, wishes, width, rows=max(len(true), 2))
     fig = Figure(figsize=(width, 2.9 * lines + 1.1 + 0.2 * deep))
-    _headline(
+    headline(
         fig,
         "What has each method learnt that people want?",
         "Only the shape of a utility matters: every curve is stretched to reach from 0 to 1 (a "
@@ -96,7 +97,7 @@ def utilities(
         for label, drawn in _draw_curves(ax, f"panels[{title!r}]", curves, at, order, colour):
             handles.setdefault(label, drawn)
         ax.set(xlim=(at[0], at[-1]), ylim=(-0.06, 1.06), yticks=(0, 0.5, 1))
-        _tidy(ax)
+        tidy(ax)
     for ax in axes[:, 0]:
         ax.set_ylabel("utility (stretched)")
     for index in range(max(len(panels) - columns, 0), len(panels)):
@@ -193,7 +194,7 @@ def agreement(
     size = 2.4 if len(rows) == 2 else 2.9
     ratio = 1.05 * len(rows)
     fig = Figure(figsize=(size * (len(true) + ratio) + 2.2, size * len(rows) + 1.2))
-    _headline(
+    headline(
         fig,
         "Who agrees with whom?",
         "Left: the share that ranks two states as a group of raters does; 50% is what guessing "
@@ -307,7 +308,7 @@ def majority_figure(
     marked = {} if found is None else dict(zip("ABC", np.asarray(states)[found], strict=True))
     across, deep = _legend_shape(len(true), [f"what “{name}” wants" for name in true], 12.6)
     fig = Figure(figsize=(12.6, 4.5 + 0.2 * deep))
-    _headline(
+    headline(
         fig,
         "Can the majority's wish be put in one order?",
         "Each group can say which of two states is better. Where the majority prefers A to B, B to "
@@ -322,7 +323,7 @@ def majority_figure(
         left.plot(at, truth, color=hue, linewidth=width, label=f"what “{name}” wants")
     left.set(xlabel="state", ylabel="utility", xlim=(at[0], at[-1]))
     left.set_title("what each group wants", fontsize=11, pad=18)
-    _tidy(left)
+    tidy(left)
     fig.legend(loc="outside lower left", ncols=across, **_LEGEND)
     shown = table[np.ix_(order, order)]
     mesh = middle.pcolormesh(at, at, shown, cmap=_PREFER, vmin=0, vmax=1, shading="nearest")

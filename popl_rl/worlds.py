@@ -4,10 +4,12 @@ import fnmatch
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import gymnasium
 import numpy as np
+import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from popl_rl.config import EnvConfig
@@ -15,9 +17,24 @@ from popl_rl.planning import Table
 from popl_rl.registry import resolve
 from popl_rl.segments import Behaviour, random_behaviour, table_behaviour
 
-__all__ = ["World", "behaviour_shares", "build_world", "has_nothing_to_do"]
+__all__ = ["Collect", "World", "behaviour_shares", "build_world", "has_nothing_to_do"]
 
 MakeEnv = Callable[[], gymnasium.Env[Any, Any]]
+
+
+class Collect(Protocol):
+    """An environment's own way to collect segments."""
+
+    def __call__(
+        self,
+        num_segments: int,
+        length: int,
+        *,
+        generator: torch.Generator,
+        progress: Callable[[int], None] | None = None,
+    ) -> TensorDictBase:
+        """Segments ``[num_segments, length]``; ``progress`` is told how many there are so far."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -31,6 +48,8 @@ class World:
         behaviours: What the data shows.
         shares: Share of each behaviour in the data.
         table: Exact model, if the environment exposes one.
+        collect: The environment's own way to collect segments, if it has one, in the place of
+            ``behaviours``.
     """
 
     make: MakeEnv
@@ -39,14 +58,16 @@ class World:
     behaviours: Mapping[str, Behaviour]
     shares: Mapping[str, float]
     table: Table | None
+    collect: Collect | None = None
 
 
 def build_world(config: EnvConfig) -> World:
     """Resolve an environment and read off what it offers.
 
-    An environment is any Gymnasium environment. Two methods are used if it has them:
-    ``transition_table()`` (exact regret labels) and ``behaviours()`` (what the data shows: by
-    name, tables ``[S, A]`` of action probabilities or functions; uniformly random otherwise).
+    An environment is any Gymnasium environment. Three methods are used if it has them:
+    ``transition_table()`` (exact regret labels), ``behaviours()`` (what the data shows: by
+    name, tables ``[S, A]`` of action probabilities or functions; uniformly random otherwise), and
+    ``collect_segments(...)`` (see :class:`Collect`), which collects the data itself.
 
     Raises:
         ValueError: If the environment cannot be resolved or built, or ``mixture`` names behaviours
@@ -91,7 +112,10 @@ def build_world(config: EnvConfig) -> World:
         for name, what in given.items()
     } or {"random": random_behaviour(env.action_space)}
     shares = behaviour_shares(list(behaviours), config.mixture)
-    return World(make, make_for_data, env, behaviours, shares, table)
+    collect = None
+    if hasattr(inner, "collect_segments"):
+        collect = cast("Any", make_for_data().unwrapped).collect_segments
+    return World(make, make_for_data, env, behaviours, shares, table, collect)
 
 
 def behaviour_shares(names: Sequence[str], mixture: Mapping[str, float] | None) -> dict[str, float]:

@@ -109,7 +109,7 @@ CASES = [
      "method.variation must be auto, gradient, gaussian, teams, got 'cosmic'"),
     ("method__variation", "gaussian",
      "method.evolve must be head for Gaussian variation, got 'all'"),
-    ("method__evolve", "some", "method.evolve must be all or head, got 'some'"),
+    ("method__evolve", "some", "method.evolve must be all, head, code, got 'some'"),
     ("method__members", 1, "method.members must be at least 2, to select among, got 1"),
     ("method__hidden", [64, 0], "method.hidden must be positive, got [64, 0]"),
     ("method__epsilon", "some",

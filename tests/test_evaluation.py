@@ -78,12 +78,12 @@ def test_success_by_hand(episodes):
 )
 def test_recovery_by_hand(value, expected):
     """Random gets 2 and the oracle 10, so one point of return is an eighth."""
-    assert recovery(value, random=2.0, oracle=10.0) == pytest.approx(expected)
+    assert recovery(value, reference=2.0, oracle=10.0) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("oracle", [2.0, 1.0, math.nan])
 def test_nothing_to_recover(oracle):
-    assert math.isnan(recovery(3.0, random=2.0, oracle=oracle))
+    assert math.isnan(recovery(3.0, reference=2.0, oracle=oracle))
 
 
 def test_group_accuracy_by_hand():

@@ -14,7 +14,8 @@ from popl_rl.config import (
 from popl_rl.experiment import build_groups, build_popl, make_data, stream
 from popl_rl.keys import ANSWER, GROUP, PAIR, RATER, UTILITY
 from popl_rl.policies import PolicySpec
-from popl_rl.segments import SegmentBank, save_tensordict
+from popl_rl.raters import make_groups
+from popl_rl.segments import SegmentBank, collect_segments, save_tensordict
 from popl_rl.variation import GaussianHead, GradientCPL
 from popl_rl.worlds import behaviour_shares, build_world
 
@@ -35,7 +36,7 @@ def tiny_groups(world):
 
 def collect(world, groups, *, seed=0, load=None, segments=30, **arguments):
     data = DataConfig(segments=segments, length=4, **arguments)
-    return make_data(data, RATERS, world, groups, seed=seed, max_steps=8, load=load)
+    return make_data(data, RATERS, world, groups, seed=seed, env=EnvConfig(max_steps=8), load=load)
 
 
 def everything_equal(one, other):
@@ -166,10 +167,53 @@ def test_groups_answer_as_configured(world):
             assert vars(group.response) == vars(response)
 
 
-def test_regret_needs_a_table():
-    world = build_world(EnvConfig(factory="gymnasium:make", id="CartPole-v1"))
-    with pytest.raises(ValueError, match="label='regret' needs the environment's transition table"):
-        build_groups(RATERS, world)
+def test_without_a_table_regret_waits_for_values_fitted_to_the_data():
+    config = EnvConfig(factory="gymnasium:make", id="CartPole-v1", max_steps=50)
+    world = build_world(config)
+    group = make_groups([lambda segments: -segments["observation"][..., 0].abs()], label="return")
+    data = DataConfig(segments=40, length=6)
+    plain, fitted = (
+        make_data(data, RatersConfig(label=label, count=4), world, group, seed=0, env=config)
+        for label in ("return", "regret")
+    )
+    assert torch.equal(plain.steps["observation"], fitted.steps["observation"])
+    assert not torch.equal(plain.worth, fitted.worth)
+    assert fitted.worth.isfinite().all()
+
+
+def test_stored_segments_are_collected_once_and_linked(world, tiny_groups, tmp_path, monkeypatch):
+    collected = []
+
+    def counting(*arguments, **options):
+        collected.append(options["num_segments"])
+        return collect_segments(*arguments, **options)
+
+    monkeypatch.setattr("popl_rl.data.collect_segments", counting)
+    store = str(tmp_path / "store")
+    one = collect(world, tiny_groups, store=store)
+    again = collect(world, tiny_groups, store=store)
+    assert collected == [30]
+    assert everything_equal(one.steps, again.steps)
+    other = collect(world, tiny_groups, store=store, segments=32)
+    assert collected == [30, 32]
+    assert other.store != one.store
+
+    one.save(tmp_path / "run" / "data")
+    assert (tmp_path / "run" / "data" / "segments").is_symlink()
+    loaded = collect(world, tiny_groups, load=tmp_path / "run" / "data")
+    assert everything_equal(loaded.steps, one.steps)
+    assert everything_equal(loaded.preferences, one.preferences)
+    assert loaded.store == one.store
+
+
+def test_a_seed_of_the_data_makes_runs_share_segments_but_not_answers(world, tiny_groups):
+    data = DataConfig(segments=30, length=4, seed=7)
+    one, other = (
+        make_data(data, RATERS, world, tiny_groups, seed=seed, env=EnvConfig(max_steps=8))
+        for seed in (0, 1)
+    )
+    assert everything_equal(one.steps, other.steps)
+    assert not everything_equal(one.preferences, other.preferences)
 
 
 def test_data_are_reproducible_and_saved_data_come_back(world, tiny_groups, tmp_path):
@@ -202,8 +246,8 @@ def test_saving_again_replaces_nothing(world, tiny_groups, tmp_path):
 def test_asking_more_raters_leaves_the_segments_alone(world, tiny_groups):
     more = RatersConfig(groups=LEFT_RIGHT, count=9, answers=3)
     data = DataConfig(segments=30, length=4)
-    one = make_data(data, RATERS, world, tiny_groups, seed=0, max_steps=8)
-    other = make_data(data, more, world, tiny_groups, seed=0, max_steps=8)
+    one = make_data(data, RATERS, world, tiny_groups, seed=0, env=EnvConfig(max_steps=8))
+    other = make_data(data, more, world, tiny_groups, seed=0, env=EnvConfig(max_steps=8))
     assert everything_equal(one.steps, other.steps)
 
 
@@ -217,8 +261,8 @@ def test_segments_may_be_memory_mapped(world, tiny_groups, tmp_path):
 
 def test_progress_is_told(world, tiny_groups):
     told = []
-    data = DataConfig(segments=30, length=4)
-    make_data(data, RATERS, world, tiny_groups, seed=0, max_steps=8, progress=told.append)
+    data, env = DataConfig(segments=30, length=4), EnvConfig(max_steps=8)
+    make_data(data, RATERS, world, tiny_groups, seed=0, env=env, progress=told.append)
     assert told[-1] == 30
 
 

@@ -88,8 +88,8 @@ def test_specialists_pass_what_their_raters_said(population, loss, bank, compari
 
 def test_groups_are_told_apart(population, loss, comparisons, generator):
     """The first four raters want the opposite of the other four."""
-    pooled = population.network(0)
-    kin = seed_with_specialists(population, pooled, loss, comparisons, generator=generator)
+    single = population.subset([0])
+    kin = seed_with_specialists(population, single, loss, comparisons, generator=generator)
     same = torch.arange(8).unsqueeze(1) // 4 == torch.arange(8) // 4
     alike = kin[same & ~torch.eye(8, dtype=torch.bool)]
     assert alike.mean() > 0.3
@@ -98,8 +98,8 @@ def test_groups_are_told_apart(population, loss, comparisons, generator):
 
 def test_the_population_is_overwritten_by_specialists(population, loss, comparisons, generator):
     before = population.members.data.clone()
-    pooled = population.network(0)
-    seed_with_specialists(population, pooled, loss, comparisons, generator=generator)
+    single = population.subset([0])
+    seed_with_specialists(population, single, loss, comparisons, generator=generator)
     for name, value in population.members.data.items(True, True):
         assert value.isfinite().all()
         assert not torch.equal(value, before[name])

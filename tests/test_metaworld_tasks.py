@@ -7,9 +7,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from popl_rl.animation import record_gif
 from popl_rl.envs import _metaworld_data as data
 from popl_rl.envs._metaworld_data import check_scripted, collect_continuations
-from popl_rl.envs._metaworld_pictures import record_gif
 from popl_rl.envs._metaworld_scripts import Scripted
 from popl_rl.envs._metaworld_simulator import task_name
 from popl_rl.envs.metaworld_tasks import (
@@ -20,6 +20,7 @@ from popl_rl.envs.metaworld_tasks import (
     gentle,
     metaworld,
 )
+from popl_rl.policy_set import PolicySet
 from popl_rl.rollouts import lockstep
 from popl_rl.segments import collect_segments
 from popl_rl.trainers.train_popl import run
@@ -311,18 +312,25 @@ def test_a_gif_has_the_episode(monkeypatch, tmp_path):
     monkeypatch.setattr(MetaworldTask, "render", lambda _: picture + np.uint8(next(shades)))
     env = MetaworldTask("button-press", max_steps=10, render_mode="rgb_array")
     path = tmp_path / "new" / "episode.gif"
-    generator = torch.Generator()
-    assert record_gif(env, Scripted("button-press"), path, generator=generator) is False
+    script, generator = Scripted("button-press"), torch.Generator()
+    # 80 steps a second, of which every fourth is shown: the start, after 4, 8, and the end.
+    assert record_gif(env, lambda seen: script.act(seen.numpy(), generator), path) == 4
     assert re.match(rb"GIF8", path.read_bytes())
-    with pytest.raises(ValueError, match="every"):
-        record_gif(env, Scripted("button-press"), path, every=0, generator=generator)
+
+
+def test_an_environment_that_does_not_render_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="render_mode='rgb_array', got None"):
+        record_gif(MetaworldTask(), lambda _: torch.zeros(1, 4), tmp_path / "a.gif")
 
 
 @pytest.mark.parametrize("task", [*TASKS, "any"])
 def test_configurations(task, config_of):
     config = config_of(f"env=metaworld/{task.replace('-', '_')}", "env.max_steps=50")
     assert (config.raters.groups, config.raters.label) == (["fast", "gentle"], "return")
-    assert config.env.options == {"task": TASKS[0] if task == "any" else task, "max_steps": 50}
+    options = dict(config.env.options)
+    speeds = options.pop("speeds", [0.25, 0.4, 0.6, 0.8])
+    assert min(speeds) == (0.6 if task == "sweep-into" else 0.25)
+    assert options == {"task": TASKS[0] if task == "any" else task, "max_steps": 50}
 
 
 def test_a_configuration_of_any_task(config_of):
@@ -333,24 +341,58 @@ def test_a_configuration_of_any_task(config_of):
     assert len(config.raters.groups) == 3
 
 
-@pytest.mark.slow
-def test_a_tiny_run(config_of, tmp_path):
-    config = config_of(
-        "env=metaworld/drawer_open",
-        "env.max_steps=24",
-        "data.segments=60",
+def test_a_number_of_segments_that_is_no_multiple_of_the_speeds_is_refused():
+    generator = torch.Generator().manual_seed(0)
+    with pytest.raises(ValueError, match=r"multiple of the scripted speeds.*got 30 segments and 4"):
+        MetaworldTask().collect_segments(30, 8, generator=generator)
+    with pytest.raises(ValueError, match="got 4 segments and 1 speeds"):
+        MetaworldTask(speeds=[0.5]).collect_segments(4, 8, generator=generator)
+
+
+def test_a_run_from_segments_to_animations(config_of, tmp_path, monkeypatch):
+    """One tiny run: style codes, one set of segments for two runs, motion and its pictures."""
+    picture = np.zeros((8, 8, 3), np.uint8)
+    monkeypatch.setattr(MetaworldTask, "render", lambda env: picture + np.uint8(env._time % 250))
+    monkeypatch.setattr(data, "check_scripted", lambda *_, **__: {})
+    overrides = (
+        "env=metaworld/button_press",
+        "env.max_steps=90",
+        f"data.store={tmp_path / 'store'}",
+        "data.segments=24",
         "data.length=20",
+        "raters.count=8",
+        "raters.answers=5",
+        "method.hidden=[16,16]",
+        "method.clone_steps=60",
         "method.members=4",
         "method.generations=2",
         "method.steps=2",
+        "method.pooled_steps=3",
+        "method.specialist_steps=2",
         "evaluation.episodes=2",
         "evaluation.new_raters=2",
-        "evaluation.baseline_steps=20",
+        "evaluation.answers=5",
+        "evaluation.baseline_steps=10",
         "logger=csv",
-        f"run_dir={tmp_path / 'run'}",
     )
-    result = run(config)
-    assert set(result.board.results.group) == {"fast", "gentle"}
-    returns = result.board.results.query("measure == 'return'")
-    assert returns.value.notna().all()
-    assert result.policies.population.spec.action_dim == 4
+    result = run(config_of(*overrides, f"run_dir={tmp_path / 'run'}"))
+    table = result.board.results
+    assert {"fast", "gentle"} <= set(table.group)
+    assert {"popl", "cpl", "oracle", "clone", "random"} <= set(table.method)
+    assert table[table.measure == "return"].value.notna().all()
+    speeds = table[table.measure.isin(["mean_hand_speed", "peak_hand_speed"])]
+    assert len(speeds) >= 20
+    assert (speeds.value > 0).all()
+    assert result.board.value("clone", "fast", "recovery") == 0
+    drawn = {path.name for path in (tmp_path / "run" / "figures").iterdir()}
+    assert {"plane.png", "profiles.png", "fast.gif", "gentle.gif"} <= drawn
+    loaded = PolicySet.load(tmp_path / "run" / "policies")
+    seen = torch.rand(3, 39, generator=torch.Generator().manual_seed(0))
+    assert torch.allclose(loaded.act(seen), result.policies.act(seen), atol=1e-4)
+
+    (store,) = (tmp_path / "store").glob("metaworld-button-press-*")
+    kept = [path for path in store.rglob("*") if path.is_file() and path.suffix != ".lock"]
+    before = {path: path.stat().st_mtime_ns for path in kept}
+    again = run(config_of(*overrides, f"run_dir={tmp_path / 'again'}"))
+    assert again.board.results.equals(table)
+    assert {path: path.stat().st_mtime_ns for path in kept} == before

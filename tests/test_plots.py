@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from popl_rl import plots
+from popl_rl import plot_style, plots
 
 PNG = b"\x89PNG\r\n"
 
@@ -47,7 +47,7 @@ def test_a_figure_is_saved_as_a_png_of_120_dots_per_inch(tmp_path: Path) -> None
     from PIL import Image
 
     fig = Figure(figsize=(2, 1))
-    plots.save(fig, tmp_path / "a.png")
+    plot_style.save(fig, tmp_path / "a.png")
     assert (tmp_path / "a.png").read_bytes().startswith(PNG)
     with Image.open(tmp_path / "a.png") as picture:
         assert picture.size == (240, 120)
@@ -379,4 +379,6 @@ def test_recovery_needs_numbers() -> None:
 
 
 def test_colours_are_all_different() -> None:
-    assert len({to_rgba(colour) for colour in plots.PALETTE.values()}) == len(plots.PALETTE)
+    assert len({to_rgba(colour) for colour in plot_style.PALETTE.values()}) == len(
+        plot_style.PALETTE
+    )

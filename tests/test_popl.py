@@ -279,7 +279,7 @@ def test_two_hidden_groups_each_find_a_policy():
         world,
         build_groups(raters, world),
         seed=0,
-        max_steps=60,
+        env=EnvConfig(max_steps=60),
     )
     bank = SegmentBank.from_segments(data.steps)
     method = MethodConfig(

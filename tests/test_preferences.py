@@ -209,3 +209,32 @@ def test_no_preferences_at_all_are_refused(preferences, tmp_path):
 def test_missing_preferences(tmp_path):
     with pytest.raises(FileNotFoundError, match="no saved data"):
         load_preferences(tmp_path / "data", num_segments=40)
+
+
+def test_pairs_of_one_start_are_all_drawn_and_no_others():
+    start = torch.tensor([5, 2, 5, 2, 2])
+    pairs = draw_pairs(5, 2000, start=start, generator=torch.Generator().manual_seed(0))
+    counts = {}
+    for pair in pairs.tolist():
+        counts[tuple(pair)] = counts.get(tuple(pair), 0) + 1
+    allowed = {(0, 2), (2, 0)} | {(i, j) for i in (1, 3, 4) for j in (1, 3, 4) if i != j}
+    assert set(counts) == allowed
+    # A first segment is any of five, and its other any of those that share its start.
+    assert counts[0, 2] / 2000 == pytest.approx(1 / 5, abs=0.04)
+    assert counts[1, 3] / 2000 == pytest.approx(1 / 10, abs=0.03)
+
+
+def test_a_start_of_a_single_segment_is_refused():
+    with pytest.raises(ValueError, match="1 of 2 starts have a single one"):
+        draw_pairs(3, 4, start=torch.tensor([0, 0, 1]), generator=torch.Generator())
+
+
+def test_raters_compare_what_begins_in_the_same_state(raters):
+    action = torch.tensor([[0, 0], [1, 0], [1, 1], [0, 1]])
+    start = torch.tensor([[0, 0], [1, 1], [0, 0], [1, 1]])
+    steps = {"action": action, "observation": torch.zeros(4, 2, 1), "info": {"start": start}}
+    segments = segment_buffer(TensorDict(steps, [4, 2]))
+    generator = torch.Generator().manual_seed(0)
+    asked = collect_preferences(segments, raters, answers_per_rater=30, generator=generator)[:]
+    assert torch.equal(start[asked[PAIR][:, 0], 0], start[asked[PAIR][:, 1], 0])
+    assert set(asked[PAIR].flatten().tolist()) == {0, 1, 2, 3}

@@ -221,7 +221,7 @@ def test_bad_groups(references, options, error, message):
 
 
 def test_a_label_and_advantages_go_together():
-    with pytest.raises(ValueError, match=r"needs advantages .* with no advantages"):
+    with pytest.raises(ValueError, match=r"needs either advantages .* with no advantages"):
         RaterGroup("her", by_reward, Response(), "regret")
     with pytest.raises(ValueError, match="and label='return' none"):
         RaterGroup("her", by_reward, Response(), "return", torch.zeros(2, 2))

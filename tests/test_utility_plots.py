@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch
 
-from popl_rl import plots, utility_plots
+from popl_rl import plot_style, utility_plots
 from popl_rl.likeness import rank_shares
 from popl_rl.majority import majority
 from popl_rl.utility_plots import Curves, agreement, majority_figure, utilities
@@ -82,7 +82,7 @@ def curves_of(ax: Axes, colour: str, dashed: bool) -> list[Any]:
 
 def test_every_method_is_drawn_beside_the_truth() -> None:
     fig = utilities(STATES, TRUTHS, three_methods())
-    blue, vermilion = plots.PALETTE["blue"], plots.PALETTE["vermilion"]
+    blue, vermilion = plot_style.PALETTE["blue"], plot_style.PALETTE["vermilion"]
     for title in ("POPL", "B-REX", "DPL"):
         for name, colour in (("zeroed", blue), ("doubled", vermilion)):
             (truth,) = curves_of(panel(fig, title), colour, dashed=True)
@@ -127,7 +127,7 @@ def test_states_may_come_in_any_order_and_as_tensors() -> None:
     ax = panel(utilities(torch.from_numpy(STATES[order]), truths, shuffled), "POPL")
     np.testing.assert_allclose(curves_of(ax, "black", dashed=False), [stretched(MEMBERS[0])])
     np.testing.assert_allclose(
-        curves_of(ax, plots.PALETTE["blue"], dashed=True), [stretched(TRUTHS["zeroed"])]
+        curves_of(ax, plot_style.PALETTE["blue"], dashed=True), [stretched(TRUTHS["zeroed"])]
     )
     np.testing.assert_array_equal(ax.lines[0].get_xdata(), STATES)
 
@@ -364,13 +364,13 @@ def test_pyplot_is_not_used_and_figures_are_saved(tmp_path: Path) -> None:
     assert "import matplotlib.pyplot" not in source
     assert "rcParams" not in source
     before = dict(mpl.rcParams)
-    plots.save(majority_figure(STATES, CYCLE, preferences(CYCLE)), tmp_path / "a.png")
+    plot_style.save(majority_figure(STATES, CYCLE, preferences(CYCLE)), tmp_path / "a.png")
     assert dict(mpl.rcParams) == before
     assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
 def test_groups_have_one_colour_in_all_figures() -> None:
-    blue = to_rgba(plots.PALETTE["blue"])
+    blue = to_rgba(plot_style.PALETTE["blue"])
     first = utilities(STATES, TRUTHS, {"a": Curves(line=STATES)}).axes[0].lines[0].get_color()
     second = agreement(STATES, TRUTHS, MEMBERS).axes[0].title.get_color()
     third = majority_figure(STATES, TRUTHS, preferences(TRUTHS)).axes[0].lines[0].get_color()

@@ -42,11 +42,14 @@ def run(config: EvaluateConfig) -> tuple[Path, Scoreboard]:
         world,
         groups,
         seed=stored.seed,
-        max_steps=stored.env.max_steps,
+        env=stored.env,
         load=kept if kept.is_dir() else None,
     )
     spec = build_spec(stored.method, world.env)
-    judge = make_judge(stored, world, groups, data, spec, seed=config.seed)
+    # What it was trained with decides, whatever is asked for now.
+    path = run_dir / "reference"
+    reference = load_set(path) if path.is_dir() else None
+    judge = make_judge(stored, world, groups, data, spec, reference=reference, seed=config.seed)
     board = judge.score(found, baselines, label=label_of(stored.method))
     number = 1 + len(list((run_dir / "evaluations").glob("[0-9]*")))
     folder = run_dir / "evaluations" / f"{number:03d}"

@@ -25,6 +25,7 @@ from popl_rl.comparisons import Comparisons
 from popl_rl.config import Config, validate
 from popl_rl.experiment import (
     build_bank,
+    build_clone,
     build_groups,
     build_popl,
     build_spec,
@@ -34,6 +35,7 @@ from popl_rl.experiment import (
     make_data,
     stream,
     train_baselines,
+    typical,
 )
 from popl_rl.findings import findings
 from popl_rl.loggers import make_logger
@@ -52,6 +54,7 @@ from popl_rl.runs import (
     write_atomic,
     write_metadata,
 )
+from popl_rl.styles import StyleClone
 from popl_rl.trainer import POPLTrainer
 from popl_rl.trainers.command import register_schemas, run_command
 from popl_rl.worlds import build_world, has_nothing_to_do
@@ -98,7 +101,7 @@ def run(config: Config) -> Result:
             world,
             groups,
             seed=config.seed,
-            max_steps=config.env.max_steps,
+            env=config.env,
             load=load,
             progress=progress.update,
         )
@@ -108,11 +111,28 @@ def run(config: Config) -> Result:
     bank = build_bank(data.steps, spec).to(config.device)
     comparisons = Comparisons.from_preferences(data.preferences, cases=config.method.cases)
     comparisons = comparisons.to(config.device)
+    clone: StyleClone | None = None
+    reference = None
+    if config.method.evolve == "code" or config.evaluation.reference == "clone":
+        with Progress("cloning", total=config.method.clone_steps) as progress:
+            clone = build_clone(
+                config.method,
+                spec,
+                bank,
+                seed=config.seed,
+                path=run_dir if data.store is None else data.store.parent,
+                progress=progress.update,
+            )
+    if clone is not None and config.evaluation.reference == "clone":
+        reference = as_set(typical(clone), alpha=config.method.alpha)
+        _save_anew(reference, run_dir / "reference")
+    if config.method.evolve != "code":
+        clone = None
 
     # 3. The population, evolved.
     learner = stream(config.seed, "learner", config.device)
-    popl = build_popl(config.method, spec, bank, comparisons, generator=learner)
-    judge = make_judge(config, world, groups, data, spec, seed=config.seed)
+    popl = build_popl(config.method, spec, bank, comparisons, clone=clone, generator=learner)
+    judge = make_judge(config, world, groups, data, spec, reference=reference, seed=config.seed)
     metrics = MetricsWriter(run_dir / "metrics.csv")
     history = MetricsWriter(run_dir / "history.csv")
     generations = generations_of(config.method)
@@ -157,6 +177,7 @@ def run(config: Config) -> Result:
                     comparisons,
                     data.preferences,
                     num_groups=len(groups),
+                    clone=clone,
                     generator=stream(config.seed, "baselines", config.device),
                     progress=baseline_bar.update,
                 )

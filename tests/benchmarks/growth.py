@@ -22,7 +22,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from popl_rl.lexicase import lexicase_selection
-from popl_rl.plots import PALETTE, save
+from popl_rl.plot_style import PALETTE, save
 from popl_rl.policies import PolicySpec
 from popl_rl.population import Population, segment_scores
 from popl_rl.segments import SegmentBank
