@@ -40,16 +40,17 @@ def build_alternative(
         spec: Sizes of the hypotheses.
         bank: Segments.
         comparisons: M strict preferences and the case of each.
-        clone: What members are style codes of; they are networks if None.
+        clone: What policies are style codes of; they are whole networks if None.
         generator: Source of all randomness.
 
     Raises:
-        ValueError: If VPL is to learn reward functions or style codes.
+        ValueError: If VPL is to learn reward functions, or style codes.
     """
     if config.algorithm == "vpl":
         if clone is not None:
             raise ValueError(
-                "method.algorithm=vpl learns networks, not style codes; set method.evolve=all"
+                "method.evolve must be all for method.algorithm=vpl, whose z takes the place of a "
+                "style code, got 'code'"
             )
         return _build_vpl(config, spec, bank, comparisons, generator=generator)
     members = 1 if config.algorithm == "cpl" else config.members
@@ -58,9 +59,9 @@ def build_alternative(
     if clone is not None:
         population: Population = StyledPopulation(clone, clone.draw(members, generator=generator))
     else:
-        evolve = cast("Any", config.evolve)
-        population = Population.create(spec, members, evolve=evolve, generator=generator)
-        population = population.to(bank.row.device)
+        population = Population.create(
+            spec, members, evolve=cast("Any", config.evolve), generator=generator
+        ).to(bank.row.device)
     loss = CPLLoss(
         population,
         bank,

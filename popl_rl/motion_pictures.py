@@ -49,7 +49,7 @@ def draw_motion(found: HypothesisSet, *, board: Scoreboard, judge: Judge) -> dic
     marks = {}
     curves = {}
     for name in names:
-        curves[f"set, catered to {name}"] = profile(board.episodes["popl", name][0], measure)
+        curves[f"set, catered to {name}"] = profile(board.episodes[board.label, name][0], measure)
     for (method, name), episodes in board.episodes.items():
         if method == "oracle":
             marks[f"oracle of {name}"] = _place(episodes, judge)[0].tolist()

@@ -17,7 +17,7 @@ def world():
 
 @pytest.fixture(scope="module")
 def segments(world):
-    return fresh_segments(DataConfig(segments=1000), world, seed=0, max_steps=60)
+    return fresh_segments(DataConfig(segments=1000), world, seed=0, env=EnvConfig(max_steps=60))
 
 
 def agreement(names, world, segments):
