@@ -119,6 +119,9 @@ class MethodConfig:
     steps: int = 15  # CPL steps of each child (gradient)
     batch_size: int = 256  # preferences per CPL step and member (gradient)
     learning_rate: float = 2e-3  # of Adam (gradient)
+    polish_steps: int = 1500  # CPL steps of the last training; 0 for none (policies, gradient, ids)
+    polish_alpha: float = 0.25  # scale of the scores in it
+    polish_conservatism: float = 0.8  # lambda of the CPL loss in it
     teams: int = 36  # teams of policies in the population (teams)
     team_generations: int = 12  # generations of 50 CPL steps (teams)
     mutation_std: float = 0.1  # standard deviation of a mutation (gaussian)
@@ -282,7 +285,12 @@ def validate(config: Config) -> None:
     expect(method.members >= 2, "method.members", "at least 2, to select among", method.members)
     expect(all(units >= 1 for units in method.hidden), "method.hidden", "positive", method.hidden)
     expect(method.alpha > 0, "method.alpha", "positive", method.alpha)
-    expect(0 < method.conservatism <= 1, "method.conservatism", "in (0, 1]", method.conservatism)
+    for name in ("conservatism", "polish_conservatism"):
+        value = getattr(method, name)
+        expect(0 < value <= 1, f"method.{name}", "in (0, 1]", value)
+    steps = method.polish_steps
+    expect(steps >= 0, "method.polish_steps", "at least 0", steps)
+    expect(method.polish_alpha > 0, "method.polish_alpha", "positive", method.polish_alpha)
     expect(0 < method.discount <= 1, "method.discount", "in (0, 1]", method.discount)
     expect(method.warm_up >= 0, "method.warm_up", "at least 0", method.warm_up)
     expect(method.learning_rate > 0, "method.learning_rate", "positive", method.learning_rate)

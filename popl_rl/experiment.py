@@ -20,6 +20,7 @@ from popl_rl.losses import CPLLoss
 from popl_rl.multi_cpl import MultiCPL
 from popl_rl.policies import PolicySpec, build_network
 from popl_rl.policy_set import HypothesisSet, as_set, load_set
+from popl_rl.polish import PolishSettings, polish
 from popl_rl.popl import POPL
 from popl_rl.population import Population
 from popl_rl.rewards import RewardSpec, reward_bank
@@ -212,7 +213,23 @@ def build_popl(
         epsilon=cast("Any", parse_epsilon(config.epsilon)),
         kin=kin,
         select=select,
+        polish=_polish_settings(config, spec),
         generator=generator,
+    )
+
+
+def _polish_settings(config: MethodConfig, spec: PolicySpec | RewardSpec) -> PolishSettings | None:
+    """None where it has not been tried: reward functions, heads, codes, no rater ids."""
+    whole = config.evolve == "all" and isinstance(spec, PolicySpec)
+    asked = variation_of(config) == "gradient" and config.cases == "rater"
+    if not (whole and asked and config.polish_steps):
+        return None
+    return PolishSettings(
+        steps=config.polish_steps,
+        learning_rate=config.learning_rate,
+        alpha=config.polish_alpha,
+        conservatism=config.polish_conservatism,
+        discount=config.discount,
     )
 
 
@@ -271,6 +288,18 @@ def final_set(popl: Learner) -> HypothesisSet:
     """The policies, or reward functions, that a finished run has found."""
     if isinstance(popl, TeamPOPL | EM | VPL):
         return popl.policies()
+    if isinstance(popl, POPL) and popl.polish is not None:
+        polished = polish(
+            popl.population,
+            popl.bank,
+            popl.comparisons,
+            alpha=popl.alpha,
+            settings=popl.polish,
+            generator=popl.generator,
+        )
+        found = as_set(polished, alpha=popl.polish.alpha, discount=popl.discount)
+        found.origin = []  # trained on, they are no longer members of the population
+        return found
     everybody = as_set(popl.population, alpha=popl.alpha, discount=popl.discount)
     return everybody.distinct(popl.bank, popl.comparisons)
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from popl_rl.comparisons import Comparisons
 from popl_rl.downsampling import spread_out
 from popl_rl.lexicase import SelectionReport, lexicase_given_first, lexicase_report
+from popl_rl.polish import PolishSettings
 from popl_rl.population import Population, segment_scores
 from popl_rl.segments import SegmentBank
 from popl_rl.selection import Selection, report
@@ -78,6 +79,8 @@ class POPL:
             each other, so that small groups are not overlooked.
         select: Rule that takes the place of lexicase selection; for whom children are, and what
             they learn, stays as it is.
+        polish: How what has been found is to be trained when all generations are done (see
+            :mod:`popl_rl.polish`); None to keep every distinct member as it is.
         generator: Source of all randomness.
 
     Attributes:
@@ -96,6 +99,7 @@ class POPL:
         epsilon: float | Literal["mad"] | None = "mad",
         kin: Tensor | None = None,
         select: Selection | None = None,
+        polish: PolishSettings | None = None,
         generator: torch.Generator,
     ) -> None:
         self.population = population
@@ -107,6 +111,7 @@ class POPL:
         self.epsilon = epsilon
         self.kin = kin
         self.select = select
+        self.polish = polish
         self.generator = generator
         self.generation = 0
 

@@ -21,6 +21,7 @@ TINY = [
     "method.generations=3",
     "method.members=4",
     "method.steps=2",
+    "method.polish_steps=20",
     "method.hidden=[8]",
     "data.segments=200",
     "data.length=6",

@@ -54,7 +54,14 @@ def absent(preferences, segments):
 def learn(preferences, segments, **method):
     """Train for three generations; return all scalars and the whole state."""
     config = MethodConfig(
-        members=4, generations=3, hidden=[6], steps=2, batch_size=16, warm_up=3, **method
+        members=4,
+        generations=3,
+        hidden=[6],
+        steps=2,
+        batch_size=16,
+        warm_up=3,
+        polish_steps=20,
+        **method,
     )
     popl = build_popl(
         config,
