@@ -11,7 +11,7 @@ from popl_rl.config import (
     RatersConfig,
     ResponseConfig,
 )
-from popl_rl.experiment import build_groups, build_popl, make_data, stream
+from popl_rl.experiment import build_groups, build_popl, final_set, make_data, stream
 from popl_rl.keys import ANSWER, GROUP, PAIR, RATER, UTILITY
 from popl_rl.policies import PolicySpec
 from popl_rl.raters import make_groups
@@ -336,3 +336,30 @@ def test_gaussian_popl_is_built(learning):
 def test_gaussian_popl_needs_heads(learning):
     with pytest.raises(ValueError, match="population must have evolve='head'"):
         build(learning, variation="gaussian")
+
+
+@pytest.mark.parametrize(
+    ("method", "wanted"),
+    [
+        ({}, True),
+        ({"polish_steps": 0}, False),
+        ({"cases": "preference"}, False),
+        ({"evolve": "head"}, False),
+        ({"variation": "gaussian", "evolve": "head"}, False),
+    ],
+)
+def test_only_whole_policies_of_known_raters_are_polished(learning, method, wanted):
+    popl = build(
+        learning, **{"variation": "gradient", "polish_steps": 30, "polish_alpha": 0.1, **method}
+    )
+    assert (popl.polish is not None) == wanted
+    if popl.polish is not None:
+        assert (popl.polish.alpha, popl.polish.conservatism) == (0.1, 0.8)
+        assert final_set(popl).alpha == 0.1
+
+
+def test_unpolished_members_come_out_as_they_are(learning):
+    popl = build(learning, variation="gradient", polish_steps=0)
+    found = final_set(popl)
+    members = popl.population.members.data[found.origin]
+    assert (found.population.members.data == members).all()

@@ -115,7 +115,8 @@ def test_training_moves_every_tensor(result):
     assert set(trained) == set(initial.keys(True, True))
     for name, value in trained.items():
         assert bool(value.isfinite().all())
-        assert not torch.equal(value, initial[name][result.policies.origin]), name
+        moved = (value.unsqueeze(1) != initial[name].unsqueeze(0)).flatten(2).any(2)
+        assert moved.all(), name  # no member of the set is one of the first population
 
 
 def world_of_two_doors():
