@@ -122,8 +122,8 @@ class MethodConfig:
     polish_steps: int = 1500  # CPL steps of the last training; 0 for none (policies, gradient, ids)
     polish_alpha: float = 0.25  # scale of the scores in it
     polish_conservatism: float = 0.8  # lambda of the CPL loss in it
-    teams: int = 36  # teams of policies in the population (teams)
-    team_generations: int = 12  # generations of 50 CPL steps (teams)
+    teams: int = 24  # teams of policies in the population (teams)
+    team_generations: int = 24  # generations of 60 CPL steps (teams)
     mutation_std: float = 0.1  # standard deviation of a mutation (gaussian)
 
 

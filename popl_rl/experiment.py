@@ -151,6 +151,10 @@ def build_popl(
             conservatism=conservatism,
             discount=config.discount,
             learning_rate=config.learning_rate,
+            polish_alpha=config.polish_alpha,
+            polish_conservatism=(
+                config.polish_conservatism if isinstance(spec, PolicySpec) else 1.0
+            ),
         )
         return TeamPOPL(
             spec, bank, comparisons, settings=settings, select=select, generator=generator
@@ -219,13 +223,17 @@ def build_popl(
 
 
 def _polish_settings(config: MethodConfig, spec: PolicySpec | RewardSpec) -> PolishSettings | None:
-    """None where it has not been tried: reward functions, heads, codes, no rater ids."""
-    whole = config.evolve == "all" and isinstance(spec, PolicySpec)
+    """None where it has not been tried: reward functions, heads, no rater ids."""
+    tried = config.evolve in ("all", "code") and isinstance(spec, PolicySpec)
     asked = variation_of(config) == "gradient" and config.cases == "rater"
-    if not (whole and asked and config.polish_steps):
+    if not (tried and asked and config.polish_steps):
         return None
     return PolishSettings(
         steps=config.polish_steps,
+        # 30 looks at who serves whom.
+        block=max(1, config.polish_steps // 30),
+        # A batch is shared by all members, so it is larger than those of children.
+        batch_size=256 if config.evolve == "all" else 4 * config.batch_size,
         learning_rate=config.learning_rate,
         alpha=config.polish_alpha,
         conservatism=config.polish_conservatism,

@@ -20,7 +20,6 @@ from popl_rl.segments import SegmentBank
 
 __all__ = ["PolishSettings", "log_likelihood", "polish", "predictive", "smallest_team"]
 
-_BLOCK = 50  # steps between two looks at who serves whom
 _CUTS = (0.2, 0.4)  # of the steps, after which members that nobody needs are dropped
 
 
@@ -30,6 +29,7 @@ class PolishSettings:
 
     Attributes:
         steps: Gradient steps.
+        block: Steps from one look at who serves whom to the next.
         batch_size: Preferences per step, the same for all members.
         learning_rate: Of Adam; held for half of the steps, then it falls to zero.
         alpha: Scale of the scores. A smaller one makes sharper policies of the same margins.
@@ -42,6 +42,7 @@ class PolishSettings:
     """
 
     steps: int = 1500
+    block: int = 50
     batch_size: int = 256
     learning_rate: float = 2e-3
     alpha: float = 0.25
@@ -160,7 +161,7 @@ def polish(
     copies = population.subset(team * (folds + 1))
     loss, optimizer = _trainer(copies, bank, settings)
     share = torch.full((len(team),), 1 / len(team), device=device)
-    blocks = -(-settings.steps // _BLOCK)
+    blocks = -(-settings.steps // settings.block)
     cuts = [int(cut * blocks) for cut in _CUTS]
     for block in range(blocks):
         likelihood = explained(copies, settings.alpha).unflatten(0, (folds + 1, -1))
@@ -177,7 +178,7 @@ def polish(
         share = served.mean(1)
         weight = (use.unsqueeze(1) * served[:, comparisons.case]).flatten(0, 1)
         optimizer.param_groups[0]["lr"] = settings.learning_rate * min(1, 2 - 2 * block / blocks)
-        for _ in range(min(_BLOCK, settings.steps - block * _BLOCK)):
+        for _ in range(min(settings.block, settings.steps - block * settings.block)):
             shape = (settings.batch_size,)
             index = torch.randint(len(comparisons), shape, generator=generator, device=device)
             preferred = comparisons.preferred[index].expand(len(copies), -1)
@@ -187,6 +188,7 @@ def polish(
             optimizer.zero_grad(set_to_none=True)
             (-(fit * weight[:, index]).mean(1).sum()).backward()  # type: ignore[no-untyped-call]
             optimizer.step()
+            copies.constrain_()
     return copies.subset(range(len(copies) - len(share), len(copies)))
 
 

@@ -7,13 +7,15 @@ that together should explain whatever is preferred:
 
     p(preference) = sum_k share_k sigmoid(Delta_k)
 
-Members of a team divide the preferences among themselves by responsibility: the E-step of EM
-(Dempster, Laird and Rubin, 1977), as in MaxMin-RLHF (Chakraborty et al., 2024), but over policies
-and without being told how many groups there are. Teams are selected by lexicase on small bundles
-of *held-out* preferences, and the smallest team that is as good as the best is the result.
+Members of a team divide the preferences among themselves by responsibility and train on those they
+speak for: EM (Dempster, Laird and Rubin, 1977), as in MaxMin-RLHF (Chakraborty et al., 2024), but
+over policies and without being told how many groups there are. Teams are selected by lexicase on
+small bundles of *held-out* preferences, and the smallest team that is as good as the best is the
+result.
 """
 
 import copy
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +25,7 @@ from torch import Tensor
 
 from popl_rl.comparisons import Comparisons
 from popl_rl.lexicase import lexicase_report
-from popl_rl.losses import CPLLoss, linear_decay
+from popl_rl.losses import CPLLoss, descend, linear_decay
 from popl_rl.policies import Spec
 from popl_rl.policy_set import HypothesisSet, as_set
 from popl_rl.popl import mad, margins
@@ -43,46 +45,49 @@ class TeamSettings:
 
     Attributes:
         teams: Teams in the population.
-        sizes: Sizes of the first teams, in turn.
+        sizes: Sizes of the first teams, in turn. A start finds all groups in one case of seven or
+            so, so most teams are as small as teams can be.
         generations: Generations to come.
         steps: Gradient steps per generation.
-        batch_size: Preferences per step, the same for all teams.
+        block: Gradient steps from one look at who speaks for whom to the next.
+        batch_size: Preferences per step, each member's own.
         learning_rate: Of Adam.
-        weight_decay: Decoupled (AdamW); without it members explain what they should not.
         alpha: Scale of the scores.
         conservatism: Lambda of the CPL loss.
         discount: Per-step discount of the scores.
-        warm_up: Pooled CPL steps that all policies start from.
-        noise: Noise on the copies of the pooled policy, relative to each layer's spread.
         held_out: Share of the preferences that only selection sees.
         bundle: Held-out preferences per lexicase case.
-        first_selection: Generation after which selection begins.
+        first_selection: Generation after which selection begins. Which start is on the way to the
+            groups does not show before some 600 steps: earlier selection fills the population
+            with copies of another.
         exchange: Chance that a further child swaps a member with another selected team.
         removal: Chance that a further child loses a member.
         polish_steps: Steps of the final, cross-fitted training of the chosen team.
-        polish_alpha: Scale of the scores in that training.
-        folds: Folds of that training.
+        polish_batch_size: Preferences per step of that training, the same for all members.
+        polish_alpha: Scale of the scores in it.
+        polish_conservatism: Lambda of the CPL loss in it; 1 for reward functions.
+        folds: Folds of it.
     """
 
-    teams: int = 36
-    sizes: tuple[int, ...] = (2, 3, 4)
-    generations: int = 12
-    steps: int = 50
-    batch_size: int = 1000
+    teams: int = 24
+    sizes: tuple[int, ...] = (2, 2, 2, 3)
+    generations: int = 24
+    steps: int = 60
+    block: int = 15
+    batch_size: int = 256
     learning_rate: float = 2e-3
-    weight_decay: float = 0.5
     alpha: float = 0.5
     conservatism: float = 0.9
     discount: float = 1.0
-    warm_up: int = 200
-    noise: float = 0.1
     held_out: float = 0.2
     bundle: int = 20
-    first_selection: int = 5
+    first_selection: int = 14
     exchange: float = 0.15
     removal: float = 0.15
     polish_steps: int = 1000
+    polish_batch_size: int = 1000
     polish_alpha: float = 0.25
+    polish_conservatism: float = 0.8
     folds: int = 4
 
 
@@ -134,8 +139,11 @@ class TeamPOPL:
         taken = torch.tensor(sizes, device=device).unsqueeze(1)
         self.active = torch.arange(places, device=device) < taken
         self.share = self.active / taken
-        self.population = self._copies_of_pooled(settings.teams * places)
-        self.loss, self.optimizer = self._trainer(self.population, settings.alpha)
+        count = settings.teams * places
+        self.population = Population.create(spec, count, generator=generator).to(device)
+        self.loss, self.optimizer = self._trainer(
+            self.population, settings.alpha, settings.conservatism
+        )
 
     def step(self) -> dict[str, float]:
         """Run one generation.
@@ -148,13 +156,19 @@ class TeamPOPL:
             best team and ``loss``.
         """
         settings = self.settings
-        value = torch.tensor(0.0)
-        for _ in range(settings.steps):
-            log_odds = F.logsigmoid(self._batch_margins(self.loss, self._draw(self.train)))
-            value = -self._explain(log_odds).mean(1).sum()
-            _descend(value, self.optimizer)
+        value = math.nan
+        for done in range(0, settings.steps, settings.block):
+            value = descend(
+                self.loss,
+                self.optimizer,
+                self.train,
+                steps=min(settings.block, settings.steps - done),
+                batch_size=settings.batch_size,
+                # Nobody speaks for nothing: an empty place needs something to draw.
+                weight=self._responsibility() + 1e-6,
+                generator=self.generator,
+            )
         self.generation += 1
-        self._update_shares()
         held, robust = self._held_out()
         best = int(robust.mean(1).argmax())
         passed = (held.unflatten(0, self.active.shape) > 0) & self.active.unsqueeze(-1)
@@ -166,7 +180,7 @@ class TeamPOPL:
             "distinct": float(settings.teams),
             "effective_parents": float(settings.teams),
             "team_size": float(self.active[best].sum()),
-            "loss": float(value.detach()) / settings.teams,
+            "loss": value,
         }
         if settings.first_selection <= self.generation < settings.generations:
             cases = self._bundles(robust)
@@ -209,7 +223,7 @@ class TeamPOPL:
         fold = self._permutation(count) % settings.folds
         row = torch.arange(count, device=fold.device)
         copies = team.subset(list(range(size)) * (settings.folds + 1))
-        loss, optimizer = self._trainer(copies, settings.polish_alpha, weight_decay=0.0)
+        loss, optimizer = self._trainer(copies, settings.polish_alpha, settings.polish_conservatism)
         block = 50
         schedule = linear_decay(optimizer, -(-settings.polish_steps // block))
         use = torch.ones(settings.folds + 1, count, device=fold.device)
@@ -224,7 +238,7 @@ class TeamPOPL:
             responsibility = (log_odds + log_share).softmax(1)[fold, :, row].T
             for _ in range(block):
                 index = self._draw(everything)
-                contrast = self._batch_margins(loss, index, everything)
+                contrast = self._batch_margins(loss, index)
                 weight = (use[:, None, index] * responsibility[:, index]).flatten(0, 1)
                 _descend((F.softplus(-contrast) * weight).mean(1).sum(), optimizer)
             schedule.step()
@@ -248,15 +262,16 @@ class TeamPOPL:
         explained: Tensor = log_odds.unflatten(0, self.active.shape) + log_share
         return explained.logsumexp(1)
 
-    @torch.no_grad()
-    def _update_shares(self) -> None:
+    def _responsibility(self) -> Tensor:
+        """Whom each member speaks for (the E-step), ``[N, M]``; shares become its means."""
         margin = margins(
             self.population, self.bank, self.train, alpha=self.alpha, discount=self.discount
         )
         log_odds = F.logsigmoid(margin).unflatten(0, self.active.shape)
         log_share = self.share.clamp(min=1e-3).log().masked_fill(~self.active, -torch.inf)
-        responsibility = (log_odds + log_share.unsqueeze(-1)).softmax(1)
-        self.share = responsibility.mean(2)
+        belongs: Tensor = (log_odds + log_share.unsqueeze(-1)).softmax(1)
+        self.share = belongs.mean(2)
+        return belongs.flatten(0, 1)
 
     def _bundles(self, values: Tensor) -> Tensor:
         """Mean of held-out values over random bundles, ``[teams, cases]``."""
@@ -287,59 +302,34 @@ class TeamPOPL:
         self.population.replace_(source.flatten())
         inherit_moments(self.optimizer, source.flatten())
 
-    def _copies_of_pooled(self, count: int) -> Population:
-        """Noisy copies of one policy trained on everything."""
-        settings = self.settings
-        single = Population.create(self.spec, 1, generator=self.generator)
-        single = single.to(self.bank.row.device)
-        loss, optimizer = self._trainer(single, settings.alpha)
-        for _ in range(settings.warm_up):
-            contrast = self._batch_margins(loss, self._draw(self.train))
-            _descend(F.softplus(-contrast).mean(), optimizer)
-        population = single.subset([0] * count)
-        for name, value in population.members.data.items(True, True):
-            if name[-1] == "weight":
-                noise = torch.randn(
-                    value.shape, generator=self.generator, device=self.generator.device
-                )
-                value.add_(settings.noise * value[0].std() * noise)
-        return population
-
     def _trainer(
-        self, population: Population, alpha: float, weight_decay: float | None = None
-    ) -> tuple[CPLLoss, torch.optim.AdamW]:
-        settings = self.settings
+        self, population: Population, alpha: float, conservatism: float
+    ) -> tuple[CPLLoss, torch.optim.Adam]:
         loss = CPLLoss(
             population,
             self.bank,
             alpha=alpha,
-            conservatism=settings.conservatism,
-            discount=settings.discount,
+            conservatism=conservatism,
+            discount=self.settings.discount,
         )
-        decay = settings.weight_decay if weight_decay is None else weight_decay
-        optimizer = torch.optim.AdamW(
-            population.members.parameters(), lr=settings.learning_rate, weight_decay=decay
-        )
-        return loss, optimizer
+        rate = self.settings.learning_rate
+        return loss, torch.optim.Adam(population.members.parameters(), lr=rate)
 
-    def _batch_margins(
-        self, loss: CPLLoss, index: Tensor, comparisons: Comparisons | None = None
-    ) -> Tensor:
+    def _batch_margins(self, loss: CPLLoss, index: Tensor) -> Tensor:
         """Conservative margins of every member on one shared batch, ``[N, B]``."""
-        source = self.train if comparisons is None else comparisons
-        preferred, other = source.preferred[index], source.other[index]
+        preferred, other = self.comparisons.preferred[index], self.comparisons.other[index]
         if self._counts is None:
             segment = torch.cat([preferred, other]).expand(len(loss.population), -1)
             better, worse = loss.scores(segment).chunk(2, dim=1)
-            return better - self.settings.conservatism * worse
+            return better - loss.conservatism * worse
         # All members see the same batch of few distinct observations: one matrix product.
         table = self.spec.table(loss.population(self.bank.observation)).flatten(1)
-        contrast = self._counts[preferred] - self.settings.conservatism * self._counts[other]
+        contrast = self._counts[preferred] - loss.conservatism * self._counts[other]
         batch: Tensor = loss.alpha * table @ contrast.T
         return batch
 
     def _draw(self, comparisons: Comparisons) -> Tensor:
-        shape, device = (self.settings.batch_size,), comparisons.preferred.device
+        shape, device = (self.settings.polish_batch_size,), comparisons.preferred.device
         return torch.randint(len(comparisons), shape, generator=self.generator, device=device)
 
     def _permutation(self, count: int) -> Tensor:

@@ -25,7 +25,6 @@ TEAMS = TeamSettings(
     generations=4,
     steps=3,
     batch_size=32,
-    warm_up=5,
     bundle=5,
     first_selection=1,
     polish_steps=50,

@@ -17,7 +17,6 @@ SMALL = TeamSettings(
     generations=6,
     steps=3,
     batch_size=32,
-    warm_up=5,
     bundle=5,
     first_selection=1,
     exchange=0.5,
@@ -71,7 +70,9 @@ def test_shares_are_mean_responsibilities_by_hand(monkeypatch, bank, comparisons
     odds = torch.logit(torch.tensor([[0.9, 0.3], [0.3, 0.9]]))
     monkeypatch.setattr(teams, "margins", lambda *_, **__: odds.repeat(2, 1))
     popl.share = torch.tensor([[0.5, 0.5], [0.75, 0.25]])
-    popl._update_shares()
+    belongs = popl._responsibility()
+    expected = torch.tensor([[0.75, 0.25], [0.25, 0.75], [0.9, 0.5], [0.1, 0.5]])
+    torch.testing.assert_close(belongs, expected)
     torch.testing.assert_close(popl.share, torch.tensor([[0.5, 0.5], [0.7, 0.3]]))
 
 
@@ -129,8 +130,8 @@ def test_visit_counts_give_the_margins_of_the_loss(seed, discount, conservatism)
     bank = SegmentBank(torch.eye(5), row, action, True)
     pair = torch.randint(40, (2, 60), generator=generator)
     comparisons = teams.Comparisons(*pair, torch.arange(60), 60)
-    popl = make(bank, comparisons, warm_up=0, discount=discount, conservatism=conservatism)
-    index = torch.arange(len(popl.train))
+    popl = make(bank, comparisons, discount=discount, conservatism=conservatism)
+    index = torch.arange(60)
     assert popl._counts is not None
     fast = popl._batch_margins(popl.loss, index)
     popl._counts = None
