@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 
 from popl_rl.alternatives import build_alternative
 from popl_rl.baselines import group_weights, train_cpl
+from popl_rl.calibration import fit_scale
 from popl_rl.comparisons import Comparisons
 from popl_rl.config import ALGORITHMS, EvaluationConfig, MethodConfig, parse_epsilon
 from popl_rl.data import Data, build_groups, fresh_segments, make_data, stream
@@ -19,9 +20,9 @@ from popl_rl.kinship import seed_with_specialists
 from popl_rl.losses import CPLLoss
 from popl_rl.multi_cpl import MultiCPL
 from popl_rl.policies import PolicySpec, build_network
-from popl_rl.policy_set import HypothesisSet, as_set, load_set
+from popl_rl.policy_set import HypothesisSet, PolicySet, as_set, load_set
 from popl_rl.polish import PolishSettings, polish
-from popl_rl.popl import POPL
+from popl_rl.popl import POPL, margins
 from popl_rl.population import Population
 from popl_rl.rewards import RewardSpec, reward_bank
 from popl_rl.segments import SegmentBank
@@ -294,9 +295,11 @@ def label_of(config: MethodConfig) -> str:
 
 def final_set(popl: Learner) -> HypothesisSet:
     """The policies, or reward functions, that a finished run has found."""
-    if isinstance(popl, TeamPOPL | EM | VPL):
+    if isinstance(popl, TeamPOPL | VPL):
         return popl.policies()
-    if isinstance(popl, POPL) and popl.polish is not None:
+    if isinstance(popl, EM):
+        found = popl.policies()
+    elif isinstance(popl, POPL) and popl.polish is not None:
         polished = polish(
             popl.population,
             popl.bank,
@@ -307,9 +310,19 @@ def final_set(popl: Learner) -> HypothesisSet:
         )
         found = as_set(polished, alpha=popl.polish.alpha, discount=popl.discount)
         found.origin = []  # trained on, they are no longer members of the population
-        return found
-    everybody = as_set(popl.population, alpha=popl.alpha, discount=popl.discount)
-    return everybody.distinct(popl.bank, popl.comparisons)
+    else:
+        everybody = as_set(popl.population, alpha=popl.alpha, discount=popl.discount)
+        found = everybody.distinct(popl.bank, popl.comparisons)
+    if isinstance(found, PolicySet):
+        margin = margins(
+            found.population,
+            popl.bank,
+            popl.comparisons,
+            alpha=found.alpha,
+            discount=found.discount,
+        )
+        found.alpha *= fit_scale(margin, popl.comparisons)
+    return found
 
 
 def train_baselines(

@@ -18,7 +18,14 @@ from popl_rl.losses import CPLLoss
 from popl_rl.population import Population, segment_scores
 from popl_rl.segments import SegmentBank
 
-__all__ = ["PolishSettings", "log_likelihood", "polish", "predictive", "smallest_team"]
+__all__ = [
+    "PolishSettings",
+    "log_likelihood",
+    "per_case",
+    "polish",
+    "predictive",
+    "smallest_team",
+]
 
 _CUTS = (0.2, 0.4)  # of the steps, after which members that nobody needs are dropped
 
@@ -77,10 +84,10 @@ def predictive(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
     Returns:
         Mean log-likelihood of each case's answers, ``[C]``.
     """
-    others = _per_case(likelihood, comparisons)[:, comparisons.case] - likelihood
+    others = per_case(likelihood, comparisons)[:, comparisons.case] - likelihood
     chosen = others.argmax(0, keepdim=True)
     count = comparisons.case.bincount(minlength=comparisons.num_cases).clamp(min=1)
-    mean: Tensor = _per_case(likelihood.gather(0, chosen)[0], comparisons) / count
+    mean: Tensor = per_case(likelihood.gather(0, chosen)[0], comparisons) / count
     return mean
 
 
@@ -173,7 +180,7 @@ def polish(
             copies = copies.subset(index.flatten())
             loss, optimizer = _trainer(copies, bank, settings)
         # The E-step, with the chance of each member as it was before.
-        joint = _per_case(likelihood, comparisons) + share.clamp(min=1e-3).log().unsqueeze(-1)
+        joint = per_case(likelihood, comparisons) + share.clamp(min=1e-3).log().unsqueeze(-1)
         served = joint.softmax(1)[fold, :, case].T
         share = served.mean(1)
         weight = (use.unsqueeze(1) * served[:, comparisons.case]).flatten(0, 1)
@@ -192,7 +199,7 @@ def polish(
     return copies.subset(range(len(copies) - len(share), len(copies)))
 
 
-def _per_case(value: Tensor, comparisons: Comparisons) -> Tensor:
+def per_case(value: Tensor, comparisons: Comparisons) -> Tensor:
     """Sums over the comparisons of each case, ``[..., M] -> [..., C]``."""
     total = value.new_zeros(*value.shape[:-1], comparisons.num_cases)
     return total.index_add_(-1, comparisons.case, value)

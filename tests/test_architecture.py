@@ -29,6 +29,7 @@ LEARNERS = [
     f"popl_rl.{name}"
     for name in (
         "brex",
+        "calibration",
         "comparisons",
         "dpl",
         "downsampling",
@@ -82,6 +83,7 @@ LAYERS = (
         "evaluation",
         "baselines",
         "brex",
+        "calibration",
         "dpl",
         "em",
         "kinship",
