@@ -101,9 +101,7 @@ def test_poison_reaches_every_hidden_key(preferences, segments):
 def test_learning_is_the_same_to_the_bit_whatever_is_hidden(
     monkeypatch, preferences, segments, method
 ):
-    quick = partial(
-        TeamSettings, warm_up=3, steps=2, batch_size=32, first_selection=1, polish_steps=4
-    )
+    quick = partial(TeamSettings, steps=2, batch_size=32, first_selection=1, polish_steps=4)
     monkeypatch.setattr("popl_rl.experiment.TeamSettings", quick)
     metrics, origin, members, state = learn(preferences, segments, **METHODS[method])
     assert len(state) >= 3
