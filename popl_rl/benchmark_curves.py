@@ -53,7 +53,7 @@ def scenario_dots(suite: Suite, results: pd.DataFrame) -> Figure:
     headline(
         fig,
         "How well is the worst-served group served?",
-        "Recovery: 1 as good as the oracle, 0 as random actions; cut off below −0.5.\n"
+        "Recovery: 1 as good as the oracle, 0 as the floor; drawn from −0.5 to 1.25.\n"
         "Small dots are seeds, large ones their mean with its 95 % interval.",
     )
     axes = fig.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)

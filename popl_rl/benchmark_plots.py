@@ -71,7 +71,7 @@ def scenario_bars(suite: Suite, results: pd.DataFrame) -> Figure:
     headline(
         fig,
         "How well is the worst-served group served?",
-        "Recovery: (return − random) / (oracle's return − random), cut off below −0.5.\n"
+        "Recovery: (return − floor) / (oracle's return − floor), cut off below −0.5.\n"
         "Dots are seeds, bars their mean with its 95 % interval.",
     )
     ax = fig.subplots()
@@ -104,7 +104,7 @@ def scenario_bars(suite: Suite, results: pd.DataFrame) -> Figure:
     ax.axhline(1, color="black", linewidth=1, linestyle="--", zorder=0)
     ax.axhline(0, color="black", linewidth=1)
     _beside(ax, "as good as the oracle", 1, "black")
-    _beside(ax, "as good as\nrandom actions", 0, "black")
+    _beside(ax, "as good as\nthe floor", 0, "black")
     low = _LOWEST if table["value"].min() < 0 else 0.0
     ax.set(ylabel="recovery", ylim=(low, _HIGHEST))
     ax.set_xticks(range(len(scenarios)), [name.replace("_", "\n", 1) for name in scenarios])

@@ -24,8 +24,9 @@ __all__ = ["markdown", "recovery_table", "stands_out", "write_report"]
 _FEW = 4  # methods whose bars can be read, and groups with rows of their own on an axis
 Numbers = np.ndarray[Any, np.dtype[np.float64]]
 _WORDS = {
-    "recovery": "(return − random) / (oracle's return − random) of the policy that a new rater is "
-    "given: 1 is as good as a policy trained with the true groups, 0 as bad as random actions.",
+    "recovery": "(return − floor) / (oracle's return − floor) of the policy that a new rater is "
+    "given: 1 is as good as a policy trained with the true groups, 0 as bad as random actions, or "
+    "as what `evaluation.reference` names in their place.",
     "±": "half of the 95 % interval of the mean over seeds (Student's t). In brackets: the lowest "
     "seed. Bold: the best, where its interval is apart from those of all other methods.",
     "coverage": "share of groups with a recovery of at least 0.9.",

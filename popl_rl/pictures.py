@@ -23,6 +23,13 @@ from popl_rl.worlds import World
 
 __all__ = ["draw", "occupancy_map"]
 
+#: What a recovery of 0 is, by ``evaluation.reference``.
+_FLOORS = {
+    "random": "random actions",
+    "clone": "a clone of the data",
+    "others": "what suits\nanother group",
+}
+
 
 def occupancy_map(episodes: TensorDictBase, cells: torch.Tensor) -> NDArray[np.float64]:
     """Share of steps spent in each cell of a grid.
@@ -73,7 +80,9 @@ def draw(
     measured = (table.measure == "recovery") & ~table.method.isin(["oracle", "random"])
     if table.value[measured].notna().any():
         # Recovery is open without an oracle, or with one no better than random.
-        figures["recovery"] = plots.recovery_bars(board.results)
+        figures["recovery"] = plots.recovery_bars(
+            board.results, floor=_FLOORS[judge.config.reference]
+        )
     history = run_dir / "history.csv"
     if history.exists() and len(names) > 1:
         snapshots = pd.read_csv(history)

@@ -321,12 +321,13 @@ def selection(metrics: pd.DataFrame) -> Figure:
     return fig
 
 
-def recovery_bars(results: pd.DataFrame) -> Figure:
+def recovery_bars(results: pd.DataFrame, *, floor: str = "random actions") -> Figure:
     """How much of an oracle's return each group gets from each method.
 
     Args:
         results: Tidy rows ``method, group, measure, value``; those of measure ``recovery`` are
             drawn. Several rows of a method and group, such as seeds, are averaged and dotted.
+        floor: What a recovery of 0 is.
 
     Raises:
         ValueError: If a column is missing, or no row of measure ``recovery`` holds a number.
@@ -349,7 +350,7 @@ def recovery_bars(results: pd.DataFrame) -> Figure:
     headline(
         fig,
         "How well is each group served?",
-        "Recovery: (return − random) / (oracle's return − random), in the group's own utility.",
+        "Recovery: (return − floor) / (oracle's return − floor), in the group's own utility.",
     )
     ax = fig.subplots()
     width = 0.8 / len(methods)
@@ -373,7 +374,7 @@ def recovery_bars(results: pd.DataFrame) -> Figure:
     ax.axhline(1, color="black", linewidth=1, linestyle="--", zorder=0)
     ax.axhline(0, color="black", linewidth=1)
     _beside(ax, "as good as the oracle", 1, "black")
-    _beside(ax, "as good as\nrandom actions", 0, "black")
+    _beside(ax, f"as good as\n{floor}", 0, "black")
     ax.set_xticks(range(len(groups)), [f"“{group}”" for group in groups])
     ax.tick_params(axis="x", length=0)
     ax.set(xlabel="raters who want", ylabel="recovery", ylim=(low and low - 0.2, high + 0.15))

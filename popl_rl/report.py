@@ -24,9 +24,9 @@ _WORDS = {
     "few answers.",
     "oracle": "trained on the answers of this group alone, so it knows what POPL has to find out.",
     "return": "sum over an episode of what the group's raters value, averaged over episodes.",
-    "recovery": "(return − random) / (oracle's return − random): 1 is as good as the oracle, 0 as "
-    "bad as random actions. The worst group's recovery is what counts: a method that serves the "
-    "majority alone has a low one.",
+    "recovery": "(return − floor) / (oracle's return − floor): 1 is as good as the oracle, 0 as "
+    "bad as random actions, or as what `evaluation.reference` names in their place. The worst "
+    "group's recovery is what counts: a method that serves the majority alone has a low one.",
     "success": "share of episodes that fulfil the task, whatever the group wants besides.",
     "accuracy": "share of pairs of segments, not used in training, that the policy ranks as the "
     "group does; 50 % is guessing.",

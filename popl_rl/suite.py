@@ -15,7 +15,7 @@ from popl_rl.plots import method_name
 __all__ = ["Scenario", "Suite", "load_suite", "parse_suite"]
 
 _NAME = re.compile(r"[A-Za-z0-9][\w.-]*")
-_BASELINES = ("cpl", "bradley_terry", "oracle", "random", "brex")
+_BASELINES = ("cpl", "bradley_terry", "oracle", "clone", "random", "brex")
 # Settings that the benchmark makes itself.
 _OURS = (
     "seed",
