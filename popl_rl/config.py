@@ -277,6 +277,9 @@ def validate(config: Config) -> None:
     expect(method.evolve in evolved, "method.evolve", ", ".join(evolved), method.evolve)
     if method.evolve == "code":
         expect(method.learns != "reward", "method.learns", "policy for style codes", method.learns)
+        whole = method.algorithm == "vpl" or method.variation == "teams"
+        whole = whole or (method.algorithm == "popl" and method.cases == "preference")
+        expect(not whole, "method.evolve", "all for VPL, and without rater ids", method.evolve)
     expect(method.clone_beta >= 0, "method.clone_beta", "at least 0", method.clone_beta)
     if method.variation == "gaussian":
         expect(

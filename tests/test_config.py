@@ -164,6 +164,12 @@ def test_valid_configurations_pass(changes):
     validate(valid(**changes))
 
 
+@pytest.mark.parametrize("changes", [{"method__algorithm": "vpl"}, {"method__cases": "preference"}])
+def test_style_codes_need_rater_ids_and_a_method_that_trains_them(changes):
+    (problem,) = problems_of(valid(method__evolve="code", **changes))
+    assert problem == "method.evolve must be all for VPL, and without rater ids, got 'code'"
+
+
 def test_a_folder_with_segments_can_be_loaded(tmp_path):
     (tmp_path / "segments").mkdir()
     validate(valid(data__load=str(tmp_path)))
