@@ -326,7 +326,7 @@ def test_an_environment_that_does_not_render_is_refused(tmp_path):
 @pytest.mark.parametrize("task", [*TASKS, "any"])
 def test_configurations(task, config_of):
     config = config_of(f"env=metaworld/{task.replace('-', '_')}", "env.max_steps=50")
-    assert (config.raters.groups, config.raters.label) == (["fast", "gentle"], "return")
+    assert (config.raters.groups, config.raters.label) == (["fast", "gentle"], "regret")
     options = dict(config.env.options)
     speeds = options.pop("speeds", [0.25, 0.4, 0.6, 0.8])
     assert min(speeds) == (0.6 if task == "sweep-into" else 0.25)

@@ -217,7 +217,7 @@ def test_popl_continues_to_the_bit(bank, comparisons, name):
 
 
 def test_teams_are_selected_by_the_rule_too(monkeypatch, bank, comparisons):
-    config = MethodConfig(cases="preference", teams=5, team_generations=12, selection="best_sum")
+    config = MethodConfig(cases="preference", teams=5, team_generations=24, selection="best_sum")
     popl = build_popl(config, PolicySpec(5, 2, True, (6,)), bank, comparisons, generator=seeded())
     sums = []
 
