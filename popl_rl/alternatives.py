@@ -1,21 +1,16 @@
 """The methods that POPL is compared with, from their configuration: pooled CPL, EM and VPL."""
 
-from typing import Any, cast
-
 import torch
 
 from popl_rl.comparisons import Comparisons
 from popl_rl.config import MethodConfig
 from popl_rl.em import EM
-from popl_rl.losses import CPLLoss
+from popl_rl.founding import cpl_training, found_population
 from popl_rl.multi_cpl import MultiCPL
 from popl_rl.policies import PolicySpec
-from popl_rl.population import Population
 from popl_rl.rewards import RewardSpec
 from popl_rl.segments import SegmentBank
-from popl_rl.styled_population import StyledPopulation
 from popl_rl.styles import StyleClone
-from popl_rl.variation import GradientCPL
 from popl_rl.vpl import VPL
 
 __all__ = ["build_alternative"]
@@ -56,29 +51,10 @@ def build_alternative(
     members = 1 if config.algorithm == "cpl" else config.members
     if config.algorithm == "em":
         members = max(1, members // config.groups) * config.groups
-    if clone is not None:
-        population: Population = StyledPopulation(clone, clone.draw(members, generator=generator))
-    else:
-        population = Population.create(
-            spec, members, evolve=cast("Any", config.evolve), generator=generator
-        ).to(bank.row.device)
-    loss = CPLLoss(
-        population,
-        bank,
-        alpha=config.alpha,
-        # Conservatism keeps policies near the data; of reward functions only differences matter.
-        conservatism=config.conservatism if isinstance(spec, PolicySpec) else 1.0,
-        discount=config.discount,
+    population = found_population(
+        config, spec, members, clone=clone, device=bank.row.device, generator=generator
     )
-    training = GradientCPL(
-        loss,
-        comparisons,
-        generations=config.generations,
-        learning_rate=config.learning_rate,
-        steps=config.steps,
-        batch_size=config.batch_size,
-        generator=generator,
-    )
+    training = cpl_training(config, population, bank, comparisons, generator=generator)
     parts = (population, bank, comparisons)
     if config.algorithm == "em":
         return EM(*parts, groups=config.groups, training=training, generator=generator)

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
+from popl_rl.answers import MISTAKE, left_out, log_likelihood
 from popl_rl.comparisons import Comparisons
-from popl_rl.polish import log_likelihood, per_case
 
 __all__ = ["SCALES", "fit_scale"]
 
@@ -12,7 +12,7 @@ __all__ = ["SCALES", "fit_scale"]
 SCALES = tuple(2.0**power for power in range(-3, 6))
 
 
-def fit_scale(margin: Tensor, comparisons: Comparisons, *, mistake: float = 0.05) -> float:
+def fit_scale(margin: Tensor, comparisons: Comparisons, *, mistake: float = MISTAKE) -> float:
     """Scale of the margins under which catering predicts raters' answers best.
 
     Members are trained with scores of some scale, but what a rater's answers tell of two members
@@ -35,10 +35,7 @@ def fit_scale(margin: Tensor, comparisons: Comparisons, *, mistake: float = 0.05
     """
     if len(margin) == 1 or comparisons.num_cases == len(comparisons):
         return 1.0
-    values = []
-    for scale in SCALES:
-        likelihood = log_likelihood(scale * margin, mistake)
-        others = per_case(likelihood, comparisons)[:, comparisons.case] - likelihood
-        chosen = others.argmax(0, keepdim=True)
-        values.append(likelihood.gather(0, chosen).mean())
+    values = [
+        left_out(log_likelihood(scale * margin, mistake), comparisons).mean() for scale in SCALES
+    ]
     return SCALES[int(torch.stack(values).argmax())]

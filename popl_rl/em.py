@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 from torch import Tensor
 
+from popl_rl.answers import per_case
 from popl_rl.comparisons import Comparisons
 from popl_rl.multi_cpl import MultiCPL
 from popl_rl.policy_set import HypothesisSet, as_set
@@ -29,8 +30,7 @@ def case_likelihood(margin: Tensor, comparisons: Comparisons) -> Tensor:
     A case is a rater, who gives all of its answers with one policy in mind, so that their chances
     ``sigmoid(Delta)`` are multiplied; or a single preference.
     """
-    total = torch.zeros(len(margin), comparisons.num_cases, device=margin.device)
-    return total.index_add_(1, comparisons.case, F.logsigmoid(margin))
+    return per_case(F.logsigmoid(margin), comparisons)
 
 
 def responsibility(joint: Tensor) -> Tensor:

@@ -15,9 +15,9 @@ from popl_rl.comparisons import Comparisons
 from popl_rl.config import ALGORITHMS, EvaluationConfig, MethodConfig, parse_epsilon
 from popl_rl.data import Data, build_groups, fresh_segments, make_data, stream
 from popl_rl.em import EM
+from popl_rl.founding import conservatism_of, cpl_training, found_population
 from popl_rl.keys import ANSWER, GROUP, Answer
 from popl_rl.kinship import seed_with_specialists
-from popl_rl.losses import CPLLoss
 from popl_rl.multi_cpl import MultiCPL
 from popl_rl.policies import PolicySpec, build_network
 from popl_rl.policy_set import HypothesisSet, PolicySet, as_set, load_set
@@ -139,8 +139,6 @@ def build_popl(
     Raises:
         ValueError: If settings do not go together, or a package that they need is missing.
     """
-    # Conservatism keeps policies near the data; of reward functions only differences matter.
-    conservatism = config.conservatism if isinstance(spec, PolicySpec) else 1.0
     if config.algorithm != "popl":
         return build_alternative(config, spec, bank, comparisons, clone=clone, generator=generator)
     select = selection_of(config.selection, tournament=config.tournament)
@@ -149,7 +147,7 @@ def build_popl(
             teams=config.teams,
             generations=config.team_generations,
             alpha=config.alpha,
-            conservatism=conservatism,
+            conservatism=conservatism_of(config, spec),
             discount=config.discount,
             learning_rate=config.learning_rate,
             polish_alpha=config.polish_alpha,
@@ -160,38 +158,27 @@ def build_popl(
         return TeamPOPL(
             spec, bank, comparisons, settings=settings, select=select, generator=generator
         )
-    if clone is not None:
-        codes = clone.draw(config.members, generator=generator)
-        population: Population = StyledPopulation(clone, codes)
-    else:
+    if config.evolve == "head" and config.features == "pooled":
         networks = [build_network(spec, generator=generator) for _ in range(config.members)]
-        if config.evolve == "head" and config.features == "pooled":
-            pooled = _pooled(config, spec, bank, comparisons, generator=generator)
-            networks[0] = pooled.network(0).cpu()
-        population = Population(networks, spec, evolve=cast("Any", config.evolve))
-        population = population.to(bank.row.device)
+        pooled = _pooled(config, spec, bank, comparisons, generator=generator)
+        networks[0] = pooled.network(0).cpu()
+        population = Population(networks, spec, evolve="head").to(bank.row.device)
+    else:
+        population = found_population(
+            config,
+            spec,
+            config.members,
+            clone=clone,
+            device=bank.row.device,
+            generator=generator,
+        )
     kin: torch.Tensor | None = None
     if variation_of(config) == "gaussian":
         variation: GaussianHead | GradientCPL = GaussianHead(
             population, std=config.mutation_std, generator=generator
         )
     else:
-        loss = CPLLoss(
-            population,
-            bank,
-            alpha=config.alpha,
-            conservatism=conservatism,
-            discount=config.discount,
-        )
-        variation = GradientCPL(
-            loss,
-            comparisons,
-            generations=config.generations,
-            learning_rate=config.learning_rate,
-            steps=config.steps,
-            batch_size=config.batch_size,
-            generator=generator,
-        )
+        variation = cpl_training(config, population, bank, comparisons, generator=generator)
         if config.kinship and config.cases == "rater":
             if config.evolve == "head":
                 single = population.subset([0])
@@ -200,7 +187,7 @@ def build_popl(
             kin = seed_with_specialists(
                 population,
                 single,
-                loss,
+                variation.loss,
                 comparisons,
                 steps=config.specialist_steps,
                 learning_rate=config.learning_rate / 2,
@@ -263,7 +250,7 @@ def _pooled(
         batch_size=batch_size,
         learning_rate=config.learning_rate,
         alpha=config.alpha,
-        conservatism=config.conservatism if isinstance(spec, PolicySpec) else 1.0,
+        conservatism=conservatism_of(config, spec),
         discount=config.discount,
         population=None if clone is None else typical(clone),
         generator=generator,

@@ -11,10 +11,10 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from popl_rl.answers import log_likelihood, per_case
 from popl_rl.comparisons import Comparisons
 from popl_rl.evaluation import new_rater_answers
 from popl_rl.keys import RATER
-from popl_rl.policy_set import answer_log_likelihood
 from popl_rl.popl import case_values
 from popl_rl.raters import RaterGroup, Raters
 
@@ -81,9 +81,7 @@ def favourites(margin: Tensor, comparisons: Comparisons) -> Tensor:
     Returns:
         ``[C]``; the first of all for a rater without answers.
     """
-    belief = torch.zeros(len(margin), comparisons.num_cases)
-    belief.index_add_(1, comparisons.case, answer_log_likelihood(margin))
-    return belief.argmax(0)
+    return per_case(log_likelihood(margin), comparisons).argmax(0)
 
 
 def gain(margin: Tensor, pooled: Tensor | None, comparisons: Comparisons) -> Gain:

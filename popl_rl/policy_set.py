@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.modules import ProbabilisticActor
 
+from popl_rl.answers import MISTAKE, log_likelihood
 from popl_rl.comparisons import Comparisons
 from popl_rl.lexicase import lexicase_selection
 from popl_rl.policies import PolicySpec, build_actor, build_network
@@ -27,12 +28,9 @@ __all__ = [
     "HypothesisSet",
     "PolicySet",
     "RewardSet",
-    "answer_log_likelihood",
     "as_set",
     "load_set",
 ]
-
-_MISTAKE = 0.05
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,7 @@ class HypothesisSet:
         answers: TensorDictBase,
         *,
         method: Literal["posterior", "lexicase"] = "posterior",
-        mistake: float = _MISTAKE,
+        mistake: float = MISTAKE,
         generator: torch.Generator | None = None,
     ) -> Catered:
         """Choose a hypothesis for one rater from a few answers.
@@ -142,9 +140,7 @@ class HypothesisSet:
         comparisons = Comparisons.from_preferences(answers, cases="preference")
         margin = self._margins(segments, comparisons).cpu()
         if method == "posterior":
-            if not 0 <= mistake < 0.5:
-                raise ValueError(f"mistake must be in [0, 0.5), got {mistake}")
-            log_weight = answer_log_likelihood(margin, mistake=mistake).sum(1)
+            log_weight = log_likelihood(margin, mistake).sum(1)
             return Catered(int(log_weight.argmax()), log_weight.softmax(0))
         if method == "lexicase":
             if generator is None:
@@ -371,17 +367,6 @@ class RewardSet(HypothesisSet):
         """
         rewards: Tensor = self.population(observation)
         return rewards
-
-
-def answer_log_likelihood(margin: Tensor, *, mistake: float = _MISTAKE) -> Tensor:
-    """Log-likelihood of strict answers in each hypothesis's eyes.
-
-    Args:
-        margin: Margins of what was preferred over what was not, of any shape.
-        mistake: Chance of a slip, which keeps single answers from ruling a hypothesis out.
-    """
-    probability = (1 - mistake) * margin.sigmoid() + mistake * (-margin).sigmoid()
-    return probability.clamp(min=1e-12).log()
 
 
 def as_set(population: Population, *, alpha: float, discount: float = 1.0) -> HypothesisSet:

@@ -10,9 +10,9 @@ how many there are.
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 from torch import Tensor
 
+from popl_rl.answers import MISTAKE, left_out, log_likelihood, per_case
 from popl_rl.comparisons import Comparisons
 from popl_rl.losses import CPLLoss
 from popl_rl.population import Population, segment_scores
@@ -20,8 +20,6 @@ from popl_rl.segments import SegmentBank
 
 __all__ = [
     "PolishSettings",
-    "log_likelihood",
-    "per_case",
     "polish",
     "predictive",
     "smallest_team",
@@ -55,23 +53,9 @@ class PolishSettings:
     alpha: float = 0.25
     conservatism: float = 0.8
     discount: float = 1.0
-    mistake: float = 0.05
+    mistake: float = MISTAKE
     folds: int = 4
     most: int = 8
-
-
-def log_likelihood(margin: Tensor, mistake: float) -> Tensor:
-    """Log-likelihood of answers with these margins, if some answers are slips.
-
-    ``log((1 - mistake) sigmoid(margin) + mistake sigmoid(-margin))``: no answer counts for less
-    than ``log(mistake)``, so that slips are not learnt by heart.
-    """
-    if not 0 <= mistake < 0.5:
-        raise ValueError(f"mistake must be in [0, 0.5), got {mistake}")
-    if mistake == 0:
-        return F.logsigmoid(margin)
-    chance = margin.new_tensor([1 - mistake, mistake]).log()
-    return torch.logaddexp(chance[0] + F.logsigmoid(margin), chance[1] + F.logsigmoid(-margin))
 
 
 def predictive(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
@@ -84,10 +68,8 @@ def predictive(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
     Returns:
         Mean log-likelihood of each case's answers, ``[C]``.
     """
-    others = per_case(likelihood, comparisons)[:, comparisons.case] - likelihood
-    chosen = others.argmax(0, keepdim=True)
     count = comparisons.case.bincount(minlength=comparisons.num_cases).clamp(min=1)
-    mean: Tensor = per_case(likelihood.gather(0, chosen)[0], comparisons) / count
+    mean: Tensor = per_case(left_out(likelihood, comparisons), comparisons) / count
     return mean
 
 
@@ -197,12 +179,6 @@ def polish(
             optimizer.step()
             copies.constrain_()
     return copies.subset(range(len(copies) - len(share), len(copies)))
-
-
-def per_case(value: Tensor, comparisons: Comparisons) -> Tensor:
-    """Sums over the comparisons of each case, ``[..., M] -> [..., C]``."""
-    total = value.new_zeros(*value.shape[:-1], comparisons.num_cases)
-    return total.index_add_(-1, comparisons.case, value)
 
 
 def _trainer(

@@ -1,7 +1,5 @@
 """A population whose members are style codes of one frozen network."""
 
-from collections.abc import Sequence
-
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from torch import Tensor, nn
@@ -77,7 +75,3 @@ class StyledPopulation(Population):
     def plain(self) -> Population:
         """The same policies as whole networks."""
         return Population([self.network(index) for index in range(len(self))], self.spec)
-
-    def subset(self, indices: Tensor | Sequence[int]) -> "StyledPopulation":
-        """Copies of some members, in the order of ``indices``."""
-        return self.with_members(self.members.data[torch.as_tensor(indices)])

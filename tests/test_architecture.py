@@ -28,6 +28,7 @@ LIBRARY = sorted(name for name, path in MODULES.items() if path.parent == PACKAG
 LEARNERS = [
     f"popl_rl.{name}"
     for name in (
+        "answers",
         "brex",
         "calibration",
         "comparisons",
@@ -67,6 +68,7 @@ LAYERS = (
     },
     {"raters", "rollouts", "segments", "policies", "rewards", "comparisons"},
     {
+        "answers",
         "preferences",
         "losses",
         "polish",
@@ -110,6 +112,7 @@ LAYERS = (
         "utility_plots",
         "experiment",
         "findings",
+        "founding",
         "hindsight",
         "panel",
         "results",

@@ -1,9 +1,9 @@
 import pytest
 import torch
 
+from popl_rl.answers import log_likelihood
 from popl_rl.calibration import SCALES, fit_scale
 from popl_rl.comparisons import Comparisons
-from popl_rl.polish import log_likelihood
 
 
 def answers(raters, each):

@@ -3,9 +3,10 @@ import math
 import pytest
 import torch
 
+from popl_rl.answers import log_likelihood
 from popl_rl.comparisons import Comparisons
 from popl_rl.policies import PolicySpec
-from popl_rl.polish import PolishSettings, log_likelihood, polish, predictive, smallest_team
+from popl_rl.polish import PolishSettings, polish, predictive, smallest_team
 from popl_rl.population import Population, segment_scores
 from popl_rl.segments import SegmentBank
 
