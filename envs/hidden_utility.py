@@ -106,7 +106,7 @@ def sample_states(
 ) -> TensorDict:
     """Draw segments without stepping through an environment.
 
-    They are distributed as those that :func:`~popl_rl.segments.collect_segments` cuts from episodes
+    They are distributed as those that :func:`~popl_rl.data.segments.collect_segments` cuts from episodes
     of :class:`HiddenUtility`, and have the same keys.
 
     Args:

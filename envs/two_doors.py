@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from popl_rl.data.tables import Table, solve
 from popl_rl.keys import ACTION, INFO, OBSERVATION, REWARD
-from popl_rl.planning import Table, solve
 from popl_rl.registry import env, rater
 
 __all__ = ["TwoDoors", "fourth", "lower", "third", "two_doors", "upper"]

@@ -8,13 +8,14 @@ from importlib.metadata import version as _version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from popl_rl.lexicase import lexicase_selection
-    from popl_rl.policy_set import PolicySet
-    from popl_rl.popl import POPL
-    from popl_rl.population import Population
-    from popl_rl.preferences import PreferenceCollector
-    from popl_rl.raters import RaterGroup, Raters
+    from popl_rl.algorithms.popl import POPL
+    from popl_rl.models.policy_set import PolicySet
+    from popl_rl.models.population import Population
+    from popl_rl.raters.collector import PreferenceCollector
+    from popl_rl.raters.groups import RaterGroup
+    from popl_rl.raters.people import Raters
     from popl_rl.registry import behaviour, env, rater
+    from popl_rl.selection.lexicase import lexicase_selection
 
 __all__ = [
     "POPL",
@@ -32,15 +33,15 @@ __all__ = [
 __version__ = _version("popl_rl")
 
 _HOME = {
-    "POPL": "popl",
-    "PolicySet": "policy_set",
-    "Population": "population",
-    "PreferenceCollector": "preferences",
-    "RaterGroup": "raters",
-    "Raters": "raters",
+    "POPL": "algorithms.popl",
+    "PolicySet": "models.policy_set",
+    "Population": "models.population",
+    "PreferenceCollector": "raters.collector",
+    "RaterGroup": "raters.groups",
+    "Raters": "raters.people",
     "behaviour": "registry",
     "env": "registry",
-    "lexicase_selection": "lexicase",
+    "lexicase_selection": "selection.lexicase",
     "rater": "registry",
 }
 

@@ -15,8 +15,8 @@ from torchrl import logger
 from torchrl.envs import GymWrapper
 from torchrl.envs.utils import check_env_specs
 
+from popl_rl.data.tables import Table
 from popl_rl.keys import INFO, OBSERVATION, REWARD
-from popl_rl.planning import Table
 
 Env: TypeAlias = gymnasium.Env[Any, Any]
 
@@ -183,7 +183,7 @@ def check_table(name: str, table: Any, env: Env, steps: list[Step]) -> None:
     """Check that a transition table says what stepping does."""
     if not isinstance(table, Table):
         raise TypeError(
-            f"env {name!r}: transition_table() must return a popl_rl.planning.Table, got a "
+            f"env {name!r}: transition_table() must return a popl_rl.data.tables.Table, got a "
             f"{type(table).__name__}."
         )
     count = getattr(env.action_space, "n", None)

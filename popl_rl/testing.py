@@ -35,11 +35,13 @@ from popl_rl._env_checks import (
     check_torchrl,
     random_steps,
 )
+from popl_rl.data.behaviours import random_behaviour
+from popl_rl.data.rollouts import MASK, lockstep
+from popl_rl.data.segments import cut_segments
+from popl_rl.data.tables import Table
 from popl_rl.keys import ACTION, INFO, OBSERVATION, REWARD
-from popl_rl.planning import Table
-from popl_rl.raters import RaterGroup, Response, Utility
-from popl_rl.rollouts import MASK, lockstep
-from popl_rl.segments import cut_segments, random_behaviour
+from popl_rl.raters.groups import RaterGroup, Utility
+from popl_rl.raters.response import Response
 
 __all__ = ["check_env", "check_rater", "likes_left", "likes_right", "tiny_env"]
 

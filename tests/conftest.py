@@ -6,10 +6,13 @@ from hydra import compose, initialize_config_module
 
 import popl_rl.trainers.run_benchmark
 import popl_rl.trainers.train_popl  # noqa: F401 - they make the schemas known to Hydra
-from popl_rl.comparisons import Comparisons
-from popl_rl.preferences import collect_preferences
-from popl_rl.raters import Raters, make_groups
-from popl_rl.segments import SegmentBank, collect_segments, random_behaviour, segment_buffer
+from popl_rl.data.bank import SegmentBank
+from popl_rl.data.behaviours import random_behaviour
+from popl_rl.data.comparisons import Comparisons
+from popl_rl.data.segments import collect_segments, segment_buffer
+from popl_rl.raters.collector import collect_preferences
+from popl_rl.raters.groups import make_groups
+from popl_rl.raters.people import Raters
 from popl_rl.testing import likes_left, likes_right, tiny_env
 
 # Small tensors are slower on several threads, and tests share their cores.

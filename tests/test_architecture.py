@@ -1,4 +1,4 @@
-"""Which module may import which, and what every module looks like."""
+"""Which package may import which, and what every module looks like."""
 
 import ast
 import importlib
@@ -18,136 +18,77 @@ FOLDERS = {
     "popl_rl.trainers": ROOT / "trainers",
     "popl_rl.configs": ROOT / "configs",
 }
-MODULES = {
-    f"{name}.{path.stem}": path
-    for name, folder in FOLDERS.items()
-    for path in sorted(folder.glob("*.py"))
-    if path.stem != "__init__"
-}
-LIBRARY = sorted(name for name, path in MODULES.items() if path.parent == PACKAGE)
-LEARNERS = [
-    f"popl_rl.{name}"
-    for name in (
-        "answers",
-        "brex",
-        "calibration",
-        "comparisons",
-        "dpl",
-        "downsampling",
-        "em",
-        "kinship",
-        "lexicase",
-        "losses",
-        "multi_cpl",
-        "policies",
-        "polish",
-        "popl",
-        "population",
-        "rewards",
+#: What each package may import besides itself. A module directly in popl_rl is of ``root``;
+#: ``testing`` is what people check their own environments, raters and methods with.
+ALLOWED = {
+    "root": set(),
+    "selection": set(),
+    "data": {"root"},
+    "raters": {"root", "data"},
+    "models": {"root", "selection", "data"},
+    "algorithms": {"root", "selection", "data", "models"},
+    "evaluation": {"root", "selection", "data", "raters", "models", "algorithms"},
+    "plotting": {"root", "data", "raters", "models", "algorithms", "evaluation"},
+    "experiments": {
+        "root",
         "selection",
-        "styled_population",
-        "styles",
-        "teams",
-        "variation",
-        "vpl",
-    )
-]
-#: A module of one layer imports modules of earlier layers, or of its own.
-LAYERS = (
-    {
-        "keys",
-        "registry",
-        "config",
-        "lexicase",
-        "_pools",
-        "downsampling",
-        "planning",
-        "majority",
-        "method_names",
-        "selection",
-    },
-    {"raters", "rollouts", "segments", "policies", "rewards", "comparisons"},
-    {
-        "answers",
-        "preferences",
-        "losses",
-        "polish",
-        "population",
-        "styled_population",
-        "styles",
-        "values",
-        "variation",
-    },
-    {
-        "popl",
-        "policy_set",
-        "teams",
-        "evaluation",
-        "baselines",
-        "brex",
-        "calibration",
-        "dpl",
-        "em",
-        "kinship",
-        "multi_cpl",
-        "ppo",
-        "reward_baselines",
-        "_env_checks",
-        "testing",
-        "vpl",
-    },
-    {
-        "acting",
-        "alternatives",
-        "animation",
-        "benchmark",
-        "benchmark_curves",
-        "benchmark_plots",
-        "benchmark_report",
         "data",
-        "jobs",
-        "likeness",
-        "reward_pictures",
-        "suite",
-        "utility_plots",
-        "experiment",
-        "findings",
-        "founding",
-        "hindsight",
-        "panel",
-        "results",
-        "loggers",
-        "motion_pictures",
-        "motion_plots",
-        "plot_style",
-        "plots",
-        "report",
-        "pictures",
-        "runs",
-        "scoreboard",
-        "store",
-        "trainer",
-        "worlds",
+        "raters",
+        "models",
+        "algorithms",
+        "evaluation",
+        "plotting",
     },
-)
+    "envs": {"root", "data", "raters"},
+    "configs": set(),
+}
+ALLOWED["testing"] = {"root", "data", "raters"}
+ALLOWED["trainers"] = {*ALLOWED["experiments"], "experiments", "configs"}
+
+
+def _modules():
+    found = {}
+    for name, folder in FOLDERS.items():
+        for path in sorted(folder.rglob("*.py")):
+            parts = path.relative_to(folder).with_suffix("").parts
+            parts = parts[:-1] if parts[-1] == "__init__" else parts
+            found[".".join([name, *parts])] = path
+    return found
+
+
+MODULES = _modules()
+LIBRARY = sorted(name for name, path in MODULES.items() if path.is_relative_to(PACKAGE))
+PACKAGES = sorted(name for name in LIBRARY if MODULES[name].name == "__init__.py")
+TREES = {module: ast.parse(path.read_text()) for module, path in MODULES.items()}
+TESTS = sorted((ROOT / "tests").rglob("*.py"))
+
+
+def package_of(module):
+    """The package of :data:`ALLOWED` that a module belongs to."""
+    parts = module.split(".")
+    if module in ("popl_rl.testing", "popl_rl._env_checks"):
+        return "testing"
+    return parts[1] if len(parts) > 1 and parts[1] in ALLOWED else "root"
 
 
 @cache
 def imports(module):
-    """Modules of the package that a module imports, wherever in its source."""
+    """Modules of the project that a module imports, wherever in its source."""
     found = set()
-    for node in ast.walk(ast.parse(MODULES[module].read_text())):
+    for node in ast.walk(TREES[module]):
         if isinstance(node, ast.Import):
             found.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{module} imports relatively"
-            found.add(node.module)
-            found.update(f"{node.module}.{alias.name}" for alias in node.names)
+            names = {f"{node.module}.{alias.name}" for alias in node.names}
+            found.update(name for name in names if name in MODULES)
+            if not names <= MODULES.keys():
+                found.add(node.module)
     return frozenset(name for name in found if name in MODULES)
 
 
 def reachable(module):
-    """Modules of the package that are imported by a module, by what it imports, and so on."""
+    """Modules of the project that are imported by a module, by what it imports, and so on."""
     seen, ahead = set(), [module]
     while ahead:
         for name in imports(ahead.pop()) - seen:
@@ -156,68 +97,84 @@ def reachable(module):
     return seen
 
 
-def layer_of(module):
-    (layer,) = [i for i, names in enumerate(LAYERS) if module.removeprefix("popl_rl.") in names]
-    return layer
+@pytest.mark.parametrize("module", sorted(set(MODULES) - {"popl_rl"}))
+def test_packages_import_one_way(module):
+    own = package_of(module)
+    foreign = {name: package_of(name) for name in imports(module)}
+    wrong = {n: p for n, p in foreign.items() if p != own and p not in ALLOWED[own]}
+    assert wrong == {}
 
 
-def test_the_layers_name_every_module_of_the_library_once():
-    named = [f"popl_rl.{name}" for layer in LAYERS for name in layer]
-    assert sorted(named) == LIBRARY
-
-
-@pytest.mark.parametrize("module", LIBRARY)
-def test_the_library_knows_no_environment_and_no_script(module):
-    source = MODULES[module].read_text()
-    outside = [name for name in imports(module) if MODULES[name].parent != PACKAGE]
-    assert outside == []
-    for folder in ("envs", "trainers"):
-        assert f"import popl_rl.{folder}" not in source
-        assert f"from popl_rl.{folder}" not in source
-        assert f"from popl_rl import {folder}" not in source
-
-
-@pytest.mark.parametrize("module", LIBRARY)
-def test_imports_go_down_the_layers(module):
-    up = [name for name in imports(module) if layer_of(name) > layer_of(module)]
-    assert up == []
-
-
-@pytest.mark.parametrize("module", LIBRARY)
+@pytest.mark.parametrize("module", sorted(MODULES))
 def test_there_are_no_circles(module):
     assert module not in reachable(module)
 
 
-@pytest.mark.parametrize("module", LEARNERS)
-def test_what_learns_cannot_see_who_voted(module):
-    forbidden = {"popl_rl.raters", "popl_rl.preferences", "popl_rl.evaluation"}
-    assert imports(module).isdisjoint(forbidden)
-    source = MODULES[module].read_text()
-    for name in ("HIDDEN", "GROUP", "UTILITY"):
-        assert name not in [node.id for node in ast.walk(ast.parse(source)) if hasattr(node, "id")]
-    assert '"hidden"' not in source
+def test_a_learner_cannot_reach_who_voted():
+    for module in MODULES:
+        if package_of(module) in ("selection", "data", "models", "algorithms"):
+            assert {package_of(name) for name in reachable(module)}.isdisjoint(
+                {"raters", "evaluation", "experiments"}
+            ), module
 
 
-@pytest.mark.parametrize("module", ["losses", "popl", "variation", "population", "comparisons"])
-def test_not_even_by_way_of_another_module(module):
-    assert reachable(f"popl_rl.{module}").isdisjoint({"popl_rl.raters", "popl_rl.preferences"})
+LEARNERS = [m for m in LIBRARY if package_of(m) in ("selection", "models", "algorithms")]
+
+
+@pytest.mark.parametrize("module", [*LEARNERS, "popl_rl.data.comparisons", "popl_rl.data.bank"])
+def test_what_learns_names_no_hidden_key(module):
+    names = {node.id for node in ast.walk(TREES[module]) if isinstance(node, ast.Name)}
+    assert names.isdisjoint({"HIDDEN", "GROUP", "UTILITY", "HIDDEN_KEYS"})
+    assert '"hidden"' not in MODULES[module].read_text()
+
+
+@pytest.mark.parametrize("path", [*MODULES.values(), *TESTS], ids=str)
+def test_no_module_uses_the_private_names_of_another(path):
+    tree = ast.parse(path.read_text())
+    ours = set()  # names under which modules of the project were imported
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("popl_rl"):
+            private = [a.name for a in node.names if a.name.startswith("_")]
+            assert private == [], f"{node.module}: {private}"
+            ours.update(
+                alias.asname or alias.name
+                for alias in node.names
+                if f"{node.module}.{alias.name}" in MODULES
+            )
+        elif isinstance(node, ast.Import):
+            ours.update(a.asname for a in node.names if a.asname and a.name in MODULES)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and node.attr.startswith("_"):
+            dotted = ast.unparse(node.value)
+            assert dotted not in ours, f"{dotted}.{node.attr}"
+            assert not dotted.startswith("popl_rl.") or node.attr.startswith("__"), dotted
 
 
 @pytest.mark.parametrize("module", [name for name in LIBRARY if name != "popl_rl.testing"])
 def test_the_library_prints_nothing(module):
-    calls = [
-        node
-        for node in ast.walk(ast.parse(MODULES[module].read_text()))
-        if isinstance(node, ast.Call)
-    ]
+    calls = [node for node in ast.walk(TREES[module]) if isinstance(node, ast.Call)]
     assert not [call for call in calls if getattr(call.func, "id", None) == "print"]
 
 
 def test_files_are_short():
-    paths = [path for name in (*FOLDERS.values(), ROOT / "tests") for path in name.rglob("*.py")]
-    assert len(paths) > 40
+    paths = [*MODULES.values(), *TESTS]
+    assert len(paths) > 150
     lengths = {path.relative_to(ROOT): len(path.read_text().splitlines()) for path in paths}
-    assert {path: length for path, length in lengths.items() if length > 500} == {}
+    assert {str(path): length for path, length in lengths.items() if length > 400} == {}
+
+
+@pytest.mark.parametrize("module", sorted(MODULES))
+def test_functions_are_short(module):
+    long = {}
+    for node in ast.walk(TREES[module]):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            first = node.body[0]
+            has_docstring = ast.get_docstring(node) is not None
+            docstring = first.end_lineno - first.lineno + 1 if has_docstring else 0
+            lines = node.end_lineno - node.lineno + 1 - docstring
+            if lines > 60:
+                long[node.name] = lines
+    assert long == {}
 
 
 @pytest.mark.parametrize("module", sorted(MODULES))
@@ -244,7 +201,16 @@ def test_names_of_the_package_are_loaded_when_used():
         popl_rl.nonsense  # noqa: B018
 
 
-@pytest.mark.parametrize("module", [name for name in LIBRARY if "._" not in name])
+@pytest.mark.parametrize("package", [name for name in PACKAGES if name != "popl_rl"])
+def test_a_package_says_what_is_inside(package):
+    """In a few lines, and with the name of every one of its modules."""
+    said = importlib.import_module(package).__doc__
+    own = [m for m in MODULES if m.rpartition(".")[0] == package and not m.split(".")[-1][0] == "_"]
+    assert [m for m in own if f"``{m.rpartition('.')[2]}``" not in said] == []
+
+
+@pytest.mark.parametrize("module", [m for m in LIBRARY if "._" not in m])
 def test_every_module_says_what_is_public(module):
-    # keys.py is one table, all of it public.
-    assert module == "popl_rl.keys" or importlib.import_module(module).__all__
+    # keys.py is one table, all of it public; a package's modules are its contents.
+    alone = module == "popl_rl.keys" or (module in PACKAGES and module != "popl_rl")
+    assert alone or importlib.import_module(module).__all__

@@ -9,22 +9,22 @@ from pathlib import Path
 import pytest
 import torch
 
-import popl_rl.popl
-import popl_rl.teams
+import popl_rl.algorithms.mixture_population
+import popl_rl.algorithms.popl
+from popl_rl.algorithms.losses import CPLLoss
+from popl_rl.algorithms.mixture_population import MixturePOPL, MixtureSettings
+from popl_rl.algorithms.popl import POPL
+from popl_rl.algorithms.variation import GaussianHead, GradientCPL
 from popl_rl.config import MethodConfig
-from popl_rl.experiment import build_popl, final_set
-from popl_rl.losses import CPLLoss
-from popl_rl.policies import PolicySpec
-from popl_rl.popl import POPL
-from popl_rl.population import Population
-from popl_rl.rewards import RewardSpec
-from popl_rl.styles import train_clone
-from popl_rl.teams import TeamPOPL, TeamSettings
-from popl_rl.variation import GaussianHead, GradientCPL
+from popl_rl.experiments.builders import build_popl, final_set
+from popl_rl.models.policies import PolicySpec
+from popl_rl.models.population import Population
+from popl_rl.models.reward_functions import RewardSpec
+from popl_rl.models.style_codes import train_clone
 
 FOLDER = Path(__file__).parent / "golden"
 SPEC = PolicySpec(5, 2, True, (8,))
-TEAMS = TeamSettings(
+TEAMS = MixtureSettings(
     teams=4,
     generations=4,
     steps=3,
@@ -51,8 +51,8 @@ def selected(monkeypatch):
 
         monkeypatch.setattr(module, "lexicase_report", report)
 
-    watch(popl_rl.popl)
-    watch(popl_rl.teams)
+    watch(popl_rl.algorithms.popl)
+    watch(popl_rl.algorithms.mixture_population)
     return found
 
 
@@ -99,7 +99,7 @@ def test_popl(bank, comparisons, selected, golden, generator, variation):
 
 
 def test_teams(bank, comparisons, selected, golden, generator):
-    popl = TeamPOPL(SPEC, bank, comparisons, settings=TEAMS, generator=generator)
+    popl = MixturePOPL(SPEC, bank, comparisons, settings=TEAMS, generator=generator)
     metrics = [popl.step() for _ in range(3)][-1]
     policies = popl.policies()
     found = numbers(popl, metrics)

@@ -3,7 +3,7 @@
 import pytest
 
 from popl_rl.config import Config, EnvConfig, RatersConfig
-from popl_rl.report import summary
+from popl_rl.evaluation.statistics import summary
 from popl_rl.trainers.train_popl import run
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]

@@ -5,13 +5,13 @@ from functools import partial
 import pytest
 import torch
 
-from popl_rl.comparisons import Comparisons
+from popl_rl.algorithms.mixture_population import MixtureSettings
 from popl_rl.config import MethodConfig
-from popl_rl.experiment import build_popl, final_set
+from popl_rl.data.bank import SegmentBank
+from popl_rl.data.comparisons import Comparisons
+from popl_rl.experiments.builders import build_popl, final_set
 from popl_rl.keys import GROUP, HIDDEN_KEYS, LEARNER_KEYS, UTILITY
-from popl_rl.policies import PolicySpec
-from popl_rl.segments import SegmentBank
-from popl_rl.teams import TeamSettings
+from popl_rl.models.policies import PolicySpec
 
 METHODS = {
     "gradient, rater cases": {"cases": "rater", "variation": "gradient"},
@@ -101,8 +101,8 @@ def test_poison_reaches_every_hidden_key(preferences, segments):
 def test_learning_is_the_same_to_the_bit_whatever_is_hidden(
     monkeypatch, preferences, segments, method
 ):
-    quick = partial(TeamSettings, steps=2, batch_size=32, first_selection=1, polish_steps=4)
-    monkeypatch.setattr("popl_rl.experiment.TeamSettings", quick)
+    quick = partial(MixtureSettings, steps=2, batch_size=32, first_selection=1, polish_steps=4)
+    monkeypatch.setattr("popl_rl.experiments.builders.MixtureSettings", quick)
     metrics, origin, members, state = learn(preferences, segments, **METHODS[method])
     assert len(state) >= 3
     for poison in (garbage, permuted, absent):

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from popl_rl import registry
-from popl_rl.planning import Table, policy_return
-from popl_rl.raters import make_groups
+from popl_rl.data.tables import Table, policy_return
+from popl_rl.raters.groups import make_groups
 from popl_rl.testing import check_env, check_rater, likes_left, likes_right, main, tiny_env
 
 Box, Discrete = gymnasium.spaces.Box, gymnasium.spaces.Discrete

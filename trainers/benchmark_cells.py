@@ -16,9 +16,9 @@ from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from popl_rl.benchmark import Cell, is_finished
 from popl_rl.config import validate
-from popl_rl.runs import write_json
+from popl_rl.experiments.cells import Cell, is_finished
+from popl_rl.storage import write_json
 from popl_rl.trainers import train_popl
 from popl_rl.trainers.command import USER_ERRORS
 
@@ -106,7 +106,7 @@ def _train(task: Task) -> None:
         config.data.load, config.data.save = str(source / "data"), False
         if (source / "baselines").is_dir():
             config.evaluation.baselines_from = str(source / "baselines")
-    if not cell.rivals:
+    if not cell.reward_baselines:
         config.evaluation.reward_baselines = False
     seconds = None
     if not _resume(config, folder):

@@ -14,15 +14,18 @@ from omegaconf import OmegaConf
 from rich.console import Console
 
 from popl_rl.config import Config, EvaluateConfig, validate
-from popl_rl.experiment import build_groups, build_spec, label_of, make_data
-from popl_rl.findings import alarm, findings
-from popl_rl.policy_set import PolicySet, RewardSet, load_set
-from popl_rl.report import markdown, results_table
-from popl_rl.results import make_judge
-from popl_rl.runs import load_config, save_config, write_atomic
-from popl_rl.scoreboard import Scoreboard
+from popl_rl.data.environments import build_world
+from popl_rl.evaluation.diagnostics import alarm, diagnostics
+from popl_rl.evaluation.results import Scoreboard
+from popl_rl.experiments.builders import build_groups, build_spec, label_of, make_data
+from popl_rl.experiments.evaluators import make_evaluator
+from popl_rl.experiments.report import markdown, results_table
+from popl_rl.experiments.run_folder import load_config, save_config
+from popl_rl.models.policy_set import PolicySet
+from popl_rl.models.reward_set import RewardSet
+from popl_rl.models.sets import load_set
+from popl_rl.storage import write_atomic
 from popl_rl.trainers.command import register_schemas, run_command
-from popl_rl.worlds import build_world
 
 
 def run(config: EvaluateConfig) -> tuple[Path, Scoreboard]:
@@ -50,8 +53,8 @@ def run(config: EvaluateConfig) -> tuple[Path, Scoreboard]:
     spec = build_spec(stored.method, world.env)
     path = run_dir / "clone"
     clone = load_set(path) if path.is_dir() else None
-    judge = make_judge(stored, world, groups, data, spec, clone=clone, seed=config.seed)
-    board = judge.score(found, baselines, label=label_of(stored.method))
+    evaluator = make_evaluator(stored, world, groups, data, spec, clone=clone, seed=config.seed)
+    board = evaluator.score(found, baselines, label=label_of(stored.method))
     number = 1 + len(list((run_dir / "evaluations").glob("[0-9]*")))
     folder = run_dir / "evaluations" / f"{number:03d}"
     beside = folder.with_name(f".{folder.name}")
@@ -63,7 +66,7 @@ def run(config: EvaluateConfig) -> tuple[Path, Scoreboard]:
     about = {
         "answers of each new rater": config.evaluation.answers,
         "seed": config.seed,
-        **findings(board, judge),
+        **diagnostics(board, evaluator),
     }
     report = markdown(board.results, title=title, about=about, figures=[])
     write_atomic(beside / "report.md", report)

@@ -22,11 +22,12 @@ from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
-from popl_rl.benchmark import Cell, claim, collect, is_finished, plan
-from popl_rl.benchmark_report import recovery_table, write_report
-from popl_rl.jobs import Job, run_jobs
-from popl_rl.runs import Progress
-from popl_rl.suite import Suite, load_suite
+from popl_rl.evaluation.suite import Suite
+from popl_rl.experiments.benchmark_report import recovery_table, write_report
+from popl_rl.experiments.cells import Cell, claim, collect, is_finished, plan
+from popl_rl.experiments.jobs import Job, run_jobs
+from popl_rl.experiments.run_folder import Progress
+from popl_rl.experiments.suites import load_suite
 from popl_rl.trainers.benchmark_cells import make_tasks, run_task
 from popl_rl.trainers.command import register_schemas, run_command
 

@@ -13,8 +13,9 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
-from popl_rl.plots import method_name
-from popl_rl.report import results_table, summary
+from popl_rl.evaluation.statistics import summary
+from popl_rl.experiments.report import results_table
+from popl_rl.plotting.run_plots import method_name
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

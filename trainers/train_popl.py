@@ -21,9 +21,14 @@ import torch
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from popl_rl.comparisons import Comparisons
+from popl_rl.algorithms.reward_baselines import train_reward_baselines
+from popl_rl.algorithms.trainer import POPLTrainer
 from popl_rl.config import Config, validate
-from popl_rl.experiment import (
+from popl_rl.data.comparisons import Comparisons
+from popl_rl.data.environments import build_world, is_stateless
+from popl_rl.evaluation.diagnostics import alarm, diagnostics
+from popl_rl.evaluation.results import Scoreboard
+from popl_rl.experiments.builders import (
     build_bank,
     build_clone,
     build_groups,
@@ -37,28 +42,24 @@ from popl_rl.experiment import (
     train_baselines,
     typical,
 )
-from popl_rl.findings import alarm, findings
-from popl_rl.loggers import make_logger
-from popl_rl.pictures import draw
-from popl_rl.policy_set import HypothesisSet, as_set
-from popl_rl.report import markdown, results_table
-from popl_rl.results import make_judge
-from popl_rl.reward_baselines import train_rivals
-from popl_rl.rewards import RewardSpec
-from popl_rl.runs import (
-    MetricsWriter,
+from popl_rl.experiments.evaluators import make_evaluator
+from popl_rl.experiments.loggers import make_logger
+from popl_rl.experiments.metrics import MetricsWriter
+from popl_rl.experiments.report import markdown, results_table
+from popl_rl.experiments.run_folder import (
     Progress,
     create_run_dir,
     load_config,
     save_config,
-    write_atomic,
     write_metadata,
 )
-from popl_rl.scoreboard import Scoreboard
-from popl_rl.styles import StyleClone
-from popl_rl.trainer import POPLTrainer
+from popl_rl.models.hypothesis_set import HypothesisSet
+from popl_rl.models.reward_functions import RewardSpec
+from popl_rl.models.sets import as_set
+from popl_rl.models.style_codes import StyleClone
+from popl_rl.plotting.run_figures import draw
+from popl_rl.storage import write_atomic
 from popl_rl.trainers.command import register_schemas, run_command
-from popl_rl.worlds import build_world, has_nothing_to_do
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ def run(config: Config) -> Result:
     # 3. The population, evolved.
     learner = stream(config.seed, "learner", config.device)
     popl = build_popl(config.method, spec, bank, comparisons, clone=clone, generator=learner)
-    judge = make_judge(config, world, groups, data, spec, clone=cloned, seed=config.seed)
+    evaluator = make_evaluator(config, world, groups, data, spec, clone=cloned, seed=config.seed)
     metrics = MetricsWriter(run_dir / "metrics.csv")
     history = MetricsWriter(run_dir / "history.csv")
     generations = generations_of(config.method)
@@ -151,7 +152,7 @@ def run(config: Config) -> Result:
             every = config.evaluation.history
             if every and (generation % every == 0 or generation in (1, generations)):
                 now = as_set(popl.population, alpha=popl.alpha, discount=popl.discount)
-                history.write(generation, judge.snapshot(now))
+                history.write(generation, evaluator.snapshot(now))
 
         trainer = POPLTrainer(
             popl,
@@ -183,9 +184,9 @@ def run(config: Config) -> Result:
                     progress=baseline_bar.update,
                 )
             _save_anew(baselines, run_dir / "baselines")
-        rivals = None
-        if config.evaluation.reward_baselines and has_nothing_to_do(world.env):
-            rivals = train_rivals(
+        reward_baselines = None
+        if config.evaluation.reward_baselines and is_stateless(world.env):
+            reward_baselines = train_reward_baselines(
                 cast("RewardSpec", spec),
                 bank,
                 comparisons,
@@ -196,10 +197,16 @@ def run(config: Config) -> Result:
 
         # 5. Judged by every hidden group; told in a table, in pictures and in words.
         label = label_of(config.method)
-        board = judge.score(found, baselines, rivals=rivals, label=label)
+        board = evaluator.score(found, baselines, reward_baselines=reward_baselines, label=label)
         write_atomic(run_dir / "results.csv", board.results.to_csv(index=False))
         figures = draw(
-            run_dir, found, baselines, board=board, judge=judge, world=world, rivals=rivals
+            run_dir,
+            found,
+            baselines,
+            board=board,
+            evaluator=evaluator,
+            world=world,
+            reward_baselines=reward_baselines,
         )
         logger.log_figures(figures, generations)
         logger.log_table("results", board.results)
@@ -209,7 +216,7 @@ def run(config: Config) -> Result:
         "comparisons": f"{len(comparisons)} strict, {comparisons.num_dropped} ties and skips",
         "cases": f"{comparisons.num_cases} ({config.method.cases}s)",
         "seed": config.seed,
-        **findings(board, judge),
+        **diagnostics(board, evaluator),
     }
     text = markdown(
         board.results,

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from popl_rl.lexicase import lexicase_selection
+from popl_rl.selection.lexicase import lexicase_selection
 
 pytestmark = [pytest.mark.benchmark, pytest.mark.timeout(1800)]
 

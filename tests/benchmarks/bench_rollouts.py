@@ -20,12 +20,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from popl_rl.data.rollouts import MASK, lockstep
 from popl_rl.envs.two_doors import two_doors
 from popl_rl.keys import OBSERVATION
-from popl_rl.policies import PolicySpec
-from popl_rl.policy_set import PolicySet
-from popl_rl.population import Population
-from popl_rl.rollouts import MASK, lockstep
+from popl_rl.models.policies import PolicySpec
+from popl_rl.models.policy_set import PolicySet
+from popl_rl.models.population import Population
 
 pytestmark = [pytest.mark.benchmark, pytest.mark.timeout(1800)]
 

@@ -13,10 +13,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from popl_rl.policies import PolicySpec
-from popl_rl.population import Population, segment_scores
-from popl_rl.rewards import RewardSpec
-from popl_rl.segments import SegmentBank
+from popl_rl.data.bank import SegmentBank
+from popl_rl.models.policies import PolicySpec
+from popl_rl.models.population import Population
+from popl_rl.models.reward_functions import RewardSpec
+from popl_rl.models.scoring import segment_scores
 
 pytestmark = [pytest.mark.benchmark, pytest.mark.timeout(1800)]
 

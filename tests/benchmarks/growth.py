@@ -21,11 +21,12 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from popl_rl.lexicase import lexicase_selection
-from popl_rl.plot_style import PALETTE, save
-from popl_rl.policies import PolicySpec
-from popl_rl.population import Population, segment_scores
-from popl_rl.segments import SegmentBank
+from popl_rl.data.bank import SegmentBank
+from popl_rl.models.policies import PolicySpec
+from popl_rl.models.population import Population
+from popl_rl.models.scoring import segment_scores
+from popl_rl.plotting.style import PALETTE, save
+from popl_rl.selection.lexicase import lexicase_selection
 
 MEMBERS = (100, 1000, 10_000)
 CASES = (1000, 10_000, 100_000)

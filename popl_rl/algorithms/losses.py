@@ -1,0 +1,178 @@
+"""The contrastive preference loss, and the loop that descends it for a whole population."""
+
+import torch
+import torch.nn.functional as F  # noqa: N812 - the name everyone knows
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.objectives.common import LossModule
+
+from popl_rl.data.bank import SegmentBank
+from popl_rl.data.comparisons import Comparisons
+from popl_rl.models.population import Population
+
+__all__ = ["CPLLoss", "cpl_loss", "descend"]
+
+
+def cpl_loss(preferred: Tensor, other: Tensor, *, conservatism: float = 1.0) -> Tensor:
+    """CPL loss of scored pairs, ``-log sigmoid(S(sigma+) - lambda S(sigma-))``.
+
+    Equation 6 of CPL (Hejna et al., arXiv 2310.13639). With ``conservatism`` below 1, raising the
+    likelihood of what was preferred pays even where the margin is large, which keeps the policy
+    near the data.
+
+    Args:
+        preferred: Scores of the preferred segments, any shape.
+        other: Scores of the others, same shape.
+        conservatism: Lambda in (0, 1].
+
+    Returns:
+        Losses, same shape.
+    """
+    return F.softplus(conservatism * other - preferred)
+
+
+class CPLLoss(LossModule):
+    """CPL loss of every member of a population, each on a batch of its own.
+
+    Contrastive Preference Learning (Hejna et al., arXiv 2310.13639, equation 6). With reward
+    functions and ``conservatism=1`` it is the Bradley–Terry loss on sums of rewards (Christiano et
+    al., 2017, equation 1).
+
+    Args:
+        population: N members.
+        bank: Segments that the batches refer to.
+        alpha: Temperature; the scale of the scores.
+        conservatism: Lambda in (0, 1].
+        discount: Per-step discount gamma.
+
+    Raises:
+        ValueError: If ``alpha`` is not positive or ``conservatism`` or ``discount`` is outside
+            (0, 1].
+
+    Example:
+        >>> loss = CPLLoss(population, bank, alpha=0.5)  # doctest: +SKIP
+        >>> batch = TensorDict(
+        ...     {"preferred": torch.randint(100, (8, 32)), "other": torch.randint(100, (8, 32))},
+        ...     [8, 32])  # doctest: +SKIP
+        >>> loss(batch)["loss_cpl"].backward()  # doctest: +SKIP
+    """
+
+    out_keys = ["loss_cpl", "accuracy"]
+
+    def __init__(
+        self,
+        population: Population,
+        bank: SegmentBank,
+        *,
+        alpha: float = 0.5,
+        conservatism: float = 0.9,
+        discount: float = 1.0,
+    ) -> None:
+        super().__init__()
+        if not alpha > 0:
+            raise ValueError(f"alpha must be positive, got {alpha}")
+        if not 0 < conservatism <= 1:
+            raise ValueError(f"conservatism must be in (0, 1], got {conservatism}")
+        if not 0 < discount <= 1:
+            raise ValueError(f"discount must be in (0, 1], got {discount}")
+        self.population = population
+        self.bank = bank
+        self.alpha = alpha
+        self.conservatism = conservatism
+        self.discount = discount
+        self._features: Tensor | None = None
+
+    @property
+    def in_keys(self) -> list[str]:
+        """Keys read from a batch."""
+        return ["preferred", "other"]
+
+    def scores(self, segment: Tensor) -> Tensor:
+        """Differentiable scores of each member's own segments.
+
+        Args:
+            segment: Segment numbers ``[N, B]``.
+
+        Returns:
+            ``[N, B]``.
+        """
+        bank, population = self.bank, self.population
+        row = bank.row[segment].flatten(1)
+        action = bank.action[segment].flatten(1, 2)
+        if bank.is_shared and len(bank.observation) <= row.shape[1]:
+            # Fewer distinct observations than steps in the batch: look at each once. What the
+            # frozen trunk makes of them never changes.
+            if self._features is None:
+                self._features = population.trunk(bank.observation)
+            output = population.from_features(self._features)
+            if population.spec.discrete:
+                # Normalise the few distinct rows, not every step of the batch.
+                table = population.spec.table(output).flatten(1)
+                cell = row * output.shape[-1] + action
+                value = table.gather(1, cell)
+            else:
+                output = output.gather(1, row.unsqueeze(-1).expand(-1, -1, output.shape[-1]))
+                value = population.spec.step_scores(output, action)
+        else:
+            value = population.spec.step_scores(population(bank.observation[row]), action)
+        steps = torch.arange(bank.row.shape[1], device=value.device).float()
+        scores: Tensor = value.view(*segment.shape, -1) @ (self.alpha * self.discount**steps)
+        return scores
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Losses of one batch per member.
+
+        Args:
+            tensordict: Batch size ``[N, B]`` with segment numbers ``preferred`` and ``other``.
+
+        Returns:
+            ``loss_cpl``, the members' mean losses summed (their gradients are independent), and
+            ``accuracy``, the share of pairs ranked as the rater did, ``[N]``.
+        """
+        segment = torch.cat([tensordict["preferred"], tensordict["other"]], 1)
+        preferred, other = self.scores(segment).chunk(2, dim=1)
+        loss = cpl_loss(preferred, other, conservatism=self.conservatism).mean(1).sum()
+        accuracy = (preferred > other).float().mean(1).detach()
+        return TensorDict({"loss_cpl": loss, "accuracy": accuracy}, [])
+
+
+def descend(
+    loss: CPLLoss,
+    optimizer: torch.optim.Optimizer,
+    comparisons: Comparisons,
+    *,
+    steps: int,
+    batch_size: int,
+    weight: Tensor | None = None,
+    generator: torch.Generator,
+) -> float:
+    """Take gradient steps on the members' CPL losses, all members at once.
+
+    Args:
+        loss: Loss of the population to train.
+        optimizer: Over the population's parameters.
+        comparisons: M strict preferences.
+        steps: Number of steps.
+        batch_size: Preferences per member and step, drawn with replacement.
+        weight: How often each member draws each preference, ``[N, M]``, non-negative, each row
+            with a positive entry. Uniform if None.
+        generator: Source of the draws.
+
+    Returns:
+        The last step's loss, averaged over members.
+    """
+    count, device = len(loss.population), comparisons.preferred.device
+    value = torch.tensor(float("nan"))
+    for _ in range(steps):
+        if weight is None:
+            shape = (count, batch_size)
+            index = torch.randint(len(comparisons), shape, generator=generator, device=device)
+        else:
+            index = torch.multinomial(weight, batch_size, replacement=True, generator=generator)
+        batch = {"preferred": comparisons.preferred[index], "other": comparisons.other[index]}
+        value = loss(TensorDict(batch, index.shape))["loss_cpl"]
+        optimizer.zero_grad(set_to_none=True)
+        value.backward()
+        optimizer.step()
+        loss.population.constrain_()
+    return float(value.detach()) / count

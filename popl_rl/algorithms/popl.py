@@ -1,0 +1,147 @@
+"""Pareto-optimal preference learning: score, select by lexicase, vary.
+
+POPL (Bahlous-Boldi, Ding, Spector, Niekum, arXiv 2406.15599) with policies that rank segments as
+CPL policies do. Nothing here reads or writes a file, and nothing knows who the raters are.
+"""
+
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from popl_rl.algorithms.refinement import RefinementSettings
+from popl_rl.algorithms.variation import Variation
+from popl_rl.data.bank import SegmentBank
+from popl_rl.data.comparisons import Comparisons
+from popl_rl.models.population import Population
+from popl_rl.models.scoring import case_values, margins, rater_accuracy
+from popl_rl.selection.downsampling import spread_out
+from popl_rl.selection.lexicase import SelectionReport, lexicase_given_first, lexicase_report
+from popl_rl.selection.mad import mad
+from popl_rl.selection.rules import Selection, report
+
+#: What a child learns from kin on whom its parent is weak, against 1 where it is strong. Without
+#: it a first child for a small group learns from the one or two raters that its parent happens to
+#: pass; much more of it blurs groups that are each other's nearest.
+_FLOOR = 0.2
+
+__all__ = ["POPL"]
+
+
+class POPL:
+    """One generation after the other: score, select, vary.
+
+    Args:
+        population: N policies, changed in place.
+        bank: Segments that the comparisons refer to.
+        comparisons: M strict preferences and the case of each.
+        variation: How children differ from their parents.
+        alpha: Scale of the scores, as in the CPL loss.
+        discount: Per-step discount of the scores.
+        epsilon: Tolerance of lexicase selection; ``"mad"``, a number, or None for none.
+        similarity: How alike the raters want, ``[C, C]`` in [-1, 1] (see :mod:`popl_rl.algorithms.rater_similarity`). If
+            given, a child is selected for one rater, whose case comes first in its order, and
+            learns from raters akin to that one. Half of these raters are random, the others unlike
+            each other, so that small groups are not overlooked.
+        select: Rule that takes the place of lexicase selection; for whom children are, and what
+            they learn, stays as it is.
+        refinement: How what has been found is to be trained when all generations are done (see
+            :mod:`popl_rl.algorithms.refinement`); None to keep every distinct member as it is.
+        generator: Source of all randomness.
+
+    Attributes:
+        generation: Generations done so far.
+    """
+
+    def __init__(
+        self,
+        population: Population,
+        bank: SegmentBank,
+        comparisons: Comparisons,
+        *,
+        variation: Variation,
+        alpha: float = 0.5,
+        discount: float = 1.0,
+        epsilon: float | Literal["mad"] | None = "mad",
+        similarity: Tensor | None = None,
+        select: Selection | None = None,
+        refinement: RefinementSettings | None = None,
+        generator: torch.Generator,
+    ) -> None:
+        self.population = population
+        self.bank = bank
+        self.comparisons = comparisons
+        self.variation = variation
+        self.alpha = alpha
+        self.discount = discount
+        self.epsilon = epsilon
+        self.similarity = similarity
+        self.select = select
+        self.refinement = refinement
+        self.generator = generator
+        self.generation = 0
+
+    def step(self) -> dict[str, float]:
+        """Run one generation.
+
+        Returns:
+            Scalars to log: ``worst_rater_accuracy`` (10 % quantile over cases of the best
+            member's accuracy), ``mean_accuracy``, ``selection_depth`` (cases used per selection),
+            ``distinct`` and ``effective_parents``, and what the variation reports.
+        """
+        margin = margins(
+            self.population, self.bank, self.comparisons, alpha=self.alpha, discount=self.discount
+        )
+        passes = margin > 0
+        values = case_values(passes, self.comparisons)
+        tolerance = mad(values) if self.epsilon == "mad" else self.epsilon
+        strong = values >= values.amax(0) - (0.0 if tolerance is None else tolerance)
+        first = None if self.similarity is None else self._first_raters(self.similarity)
+        selected = self._select(values, first, tolerance)
+        strength = strong.float()[selected.parents]
+        if self.similarity is not None and first is not None:
+            strength = (strength + _FLOOR) * self.similarity[first].clamp(min=0)
+        varied = self.variation(selected.parents, strength[:, self.comparisons.case])
+        self.generation += 1
+        return {
+            "worst_rater_accuracy": rater_accuracy(values),
+            "mean_accuracy": float(passes.float().mean()),
+            "selection_depth": float(selected.depth.float().mean()),
+            "distinct": float(selected.distinct),
+            "effective_parents": selected.effective,
+            **varied,
+        }
+
+    def _select(
+        self, values: Tensor, first: Tensor | None, tolerance: float | Tensor | None
+    ) -> SelectionReport:
+        count, generator = len(self.population), self.generator
+        if self.select is not None:
+            return report(values, self.select(values, count, generator=generator))
+        if first is None:
+            return lexicase_report(values, count, epsilon=tolerance, generator=generator)
+        return lexicase_given_first(values, first, epsilon=tolerance, generator=generator)
+
+    def _first_raters(self, similarity: Tensor) -> Tensor:
+        """For whom the children are: half at random, half unlike each other, ``[N]``."""
+        spread = len(self.population) // 2
+        shape = (len(self.population) - spread,)
+        device = self.generator.device
+        first = torch.randint(len(similarity), shape, generator=self.generator, device=device)
+        return torch.cat([first, spread_out(similarity, spread, generator=self.generator)])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the next generation depends on."""
+        return {
+            "generation": self.generation,
+            "members": self.population.members.data.clone().to_dict(),
+            "variation": self.variation.state_dict(),
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from :meth:`state_dict`, bit for bit."""
+        self.generation = int(state["generation"])
+        self.population.members.data.update_(state["members"])
+        self.variation.load_state_dict(state["variation"])
+        self.generator.set_state(state["generator"].cpu())

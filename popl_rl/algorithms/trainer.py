@@ -1,0 +1,192 @@
+"""POPL as a TorchRL Trainer: generations, checkpoints, and resuming to the bit.
+
+A frame of the Trainer is a generation: its collector yields one empty batch for each, and its
+optimisation step is :meth:`POPL.step <popl_rl.algorithms.popl.POPL.step>`. What that buys over a loop of
+five lines is TorchRL's hooks (``register_op``, ``EarlyStopping``, ``request_stop``) and its
+registration of everything that has a state in one checkpoint.
+"""
+
+import re
+import shutil
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+from tensordict import TensorDict, TensorDictBase
+from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation, GlobalRNGState
+
+with warnings.catch_warnings():
+    # TorchRL 0.14 deprecates a base class that it still derives from, and says so when imported.
+    warnings.simplefilter("ignore", DeprecationWarning)
+    from torchrl.trainers import OptimizationStepper, Trainer
+
+__all__ = ["Generational", "POPLTrainer"]
+
+
+class Generational(Protocol):
+    """What can be trained generation by generation, as :class:`~popl_rl.algorithms.popl.POPL` can.
+
+    Attributes:
+        generation: Generations done so far.
+    """
+
+    generation: int
+
+    def step(self) -> dict[str, float]:
+        """Run one generation and return scalars to log."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the next generation depends on."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        ...
+
+
+class POPLTrainer(Trainer):
+    """Runs a POPL to a number of generations and keeps its last two checkpoints.
+
+    A checkpoint is written every ``checkpoint_interval`` generations and after the last one, after
+    ``on_generation`` has returned: what that function wrote is never behind the checkpoint.
+
+    Args:
+        popl: What to train; changed in place.
+        generations: Generation to stop at, counted from the first of the run.
+        checkpoint_dir: Folder of the checkpoints; created with the first one.
+        checkpoint_interval: Generations between two checkpoints.
+        on_generation: Called with the number of generations done and the scalars of the last one.
+
+    Raises:
+        ValueError: If ``generations`` or ``checkpoint_interval`` is not positive.
+
+    Example:
+        >>> trainer = POPLTrainer(  # doctest: +SKIP
+        ...     popl, generations=60, checkpoint_dir=run / "checkpoint", checkpoint_interval=5,
+        ...     on_generation=lambda generation, metrics: writer.write(generation, metrics),
+        ... )
+        >>> trainer.resume()  # doctest: +SKIP
+        0
+        >>> trainer.train()  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        popl: Generational,
+        *,
+        generations: int,
+        checkpoint_dir: Path,
+        checkpoint_interval: int,
+        on_generation: Callable[[int, dict[str, float]], None],
+    ) -> None:
+        for name, value in [
+            ("generations", generations),
+            ("checkpoint_interval", checkpoint_interval),
+        ]:
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+        super().__init__(
+            collector=_Generations(popl, generations),
+            total_frames=generations,
+            frame_skip=1,
+            optim_steps_per_batch=1,
+            # Never called, as the stepper takes its place, but saved under this name.
+            loss_module=popl,
+            optimization_stepper=_Step(popl, on_generation),
+            progress_bar=False,
+            # An archive carries a CRC of every file: TorchRL's directory format would fill a
+            # truncated tensor file with zeros and load it.
+            checkpoint=Checkpoint(rng=GlobalRNGState(), format="archive"),
+            checkpoint_rotation=CheckpointRotation(checkpoint_dir, keep_last=2),
+            # The Trainer saves once more than this many frames have passed.
+            save_trainer_interval=checkpoint_interval - 1,
+        )
+        self.popl = popl
+        self.collected_frames = popl.generation
+
+    def resume(self) -> int:
+        """Continue from the newest checkpoint that can be read.
+
+        Returns:
+            Generations done: 0 or what ``popl`` already had if there is no checkpoint. Rows that
+            were logged after this generation will be logged again.
+
+        Raises:
+            ValueError: If there are checkpoints and none of them can be read into this ``popl``.
+        """
+        directory = self.checkpoint_rotation.directory
+        _remove_unfinished(directory)
+        found = sorted(directory.glob("checkpoint-*"), reverse=True)
+        problems = []
+        for path in found:
+            try:
+                self._restore(path)
+            except Exception as error:  # a damaged archive makes zipfile and json raise many kinds
+                problems.append(f"{path.name}: {error}")
+                continue
+            if problems:
+                warnings.warn(
+                    f"resumed from the earlier checkpoint {path.name}, because "
+                    f"{'; '.join(problems)}",
+                    stacklevel=2,
+                )
+            return self.popl.generation
+        if found:
+            raise ValueError(
+                f"no checkpoint in {directory} can be resumed ({'; '.join(problems)}); they are "
+                "damaged or of a run with another configuration: resume with that run's config, "
+                "or start again in another run_dir"
+            )
+        return self.popl.generation
+
+    def _restore(self, path: Path) -> None:
+        if not Checkpoint.is_checkpoint(path):
+            raise CheckpointError("not a checkpoint, or cut off")
+        self.load_from_file(path)
+
+
+class _Step(OptimizationStepper):
+    """One generation in the place of an optimisation step."""
+
+    def __init__(
+        self, popl: Generational, on_generation: Callable[[int, dict[str, float]], None]
+    ) -> None:
+        self.popl = popl
+        self.on_generation = on_generation
+
+    def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
+        metrics = self.popl.step()
+        self.on_generation(self.popl.generation, metrics)
+        return TensorDict(metrics)
+
+
+class _Generations:
+    """The collector that the Trainer asks for: one empty batch for each generation to do."""
+
+    init_random_frames = 0
+
+    def __init__(self, popl: Generational, generations: int) -> None:
+        self.popl = popl
+        self.generations = generations
+
+    def __iter__(self) -> Iterator[TensorDict]:
+        for _ in range(self.popl.generation, self.generations):
+            yield TensorDict(batch_size=[1])
+
+    def shutdown(self) -> None:
+        """Nothing runs in the background."""
+
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """``popl`` knows how far it is."""
+
+
+def _remove_unfinished(directory: Path) -> None:
+    # Left by a process that was killed while TorchRL wrote or removed a checkpoint.
+    for path in directory.glob(".checkpoint-*"):
+        if re.search(r"\.(stage|archive|backup|delete)-[0-9a-f]{32}$", path.name):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()

@@ -1,0 +1,373 @@
+"""A policy for every rater, by a latent variable that is read off the rater's answers.
+
+In the spirit of variational preference learning (VPL; Poddar et al., 2024, arXiv 2408.10075), with
+policies trained by CPL in the place of reward functions: an encoder of the *set* of a rater's
+answers gives a belief ``q(z | answers)`` about what the rater wants, and one policy
+``pi(a | s, z)`` serves everybody. For each z that is an ordinary policy: what z adds to the first
+layer is a bias. So the result is a set of policies as everywhere here, at the beliefs about some
+raters.
+"""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal, Self
+
+import torch
+import torch.nn.functional as F  # noqa: N812 - the name everyone knows
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from popl_rl.algorithms.losses import cpl_loss
+from popl_rl.data.bank import SegmentBank
+from popl_rl.data.comparisons import Comparisons
+from popl_rl.models.hypothesis_set import Catered
+from popl_rl.models.policies import PolicySpec, build_network
+from popl_rl.models.policy_set import PolicySet
+from popl_rl.models.population import Population
+from popl_rl.models.schedules import linear_decay
+from popl_rl.models.scoring import case_values, margins, rater_accuracy
+
+__all__ = ["VPL", "AnswerEncoder", "EncodedPolicySet", "divergence", "spread_points"]
+
+_MOST = 64  # policies in the set
+
+
+def divergence(mean: Tensor, log_std: Tensor) -> Tensor:
+    """KL divergence of N(mean, std) from N(0, 1), summed over the last dimension, ``[...]``."""
+    return ((2 * log_std).exp() + mean.square() - 1 - 2 * log_std).sum(-1) / 2
+
+
+def spread_points(points: Tensor, count: int) -> Tensor:
+    """Choose points far from each other: farthest first, from the one farthest from the middle.
+
+    Args:
+        points: ``[C, L]``.
+        count: Points to choose; all if there are no more.
+
+    Returns:
+        Different rows, ``[min(count, C)]``, int64.
+    """
+    count = min(count, len(points))
+    chosen = [int((points - points.mean(0)).norm(dim=1).argmax())]
+    nearest = torch.full((len(points),), torch.inf, device=points.device)
+    for _ in range(count - 1):
+        nearest = torch.minimum(nearest, (points - points[chosen[-1]]).norm(dim=1))
+        nearest[chosen[-1]] = -torch.inf
+        chosen.append(int(nearest.argmax()))
+    return torch.tensor(chosen, device=points.device)
+
+
+class AnswerEncoder(nn.Module):
+    """What a rater wants, as a belief ``N(mean, std)`` about z, from any number of answers.
+
+    Steps are embedded and averaged over a segment, the two segments of an answer are joined, and
+    answers are embedded and averaged: neither the order of answers nor their number matters.
+
+    Args:
+        spec: Sizes of observations and actions.
+        latent: Length L of z.
+        units: Units of each hidden layer.
+        generator: Source of the initial weights.
+    """
+
+    def __init__(
+        self, spec: PolicySpec, latent: int, *, units: int = 64, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.spec = spec
+        wide = spec.observation_dim + spec.action_dim
+        # Networks of these sizes; what their outputs mean is our affair.
+        layers = [
+            build_network(PolicySpec(inputs, outputs, True, hidden), generator=generator)
+            for inputs, outputs, hidden in (
+                (wide, units, ()),
+                (2 * units, units, ()),
+                (units, 2 * latent, (units,)),
+            )
+        ]
+        self.step, self.answer, self.belief = layers
+
+    def segments(self, bank: SegmentBank, segment: Tensor) -> Tensor:
+        """Embedded segments, ``[...]`` -> ``[..., units]``."""
+        action = bank.action[segment]
+        if self.spec.discrete:
+            action = F.one_hot(action, self.spec.action_dim).float()
+        steps = torch.cat([bank.observation[bank.row[segment]], action], -1)
+        embedded: Tensor = self.step(steps).relu().mean(-2)
+        return embedded
+
+    def forward(self, bank: SegmentBank, preferred: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
+        """The belief about raters.
+
+        Args:
+            bank: What the answers are about.
+            preferred: Segments that each of B raters preferred, ``[B, K]``.
+            other: Segments that they preferred these to, ``[B, K]``.
+
+        Returns:
+            Mean and log standard deviation, each ``[B, L]``.
+        """
+        pair = torch.cat([self.segments(bank, preferred), self.segments(bank, other)], -1)
+        mean, log_std = self.belief(self.answer(pair).relu().mean(-2)).chunk(2, -1)
+        return mean, log_std.clamp(-5, 2)
+
+
+class EncodedPolicySet(PolicySet):
+    """Policies for different z, of which a new rater is given the one that an encoder believes in.
+
+    What :meth:`save` writes is a :class:`PolicySet`, without the encoder: once loaded, new raters
+    are catered to by how well the policies explain their answers, as any set does.
+
+    Args:
+        population: N policies.
+        encoder: Tells what a rater wants.
+        z: For which z the policies are, ``[N, L]``.
+        alpha: Scale of their scores, as trained.
+        discount: Per-step discount of their scores.
+    """
+
+    def __init__(
+        self,
+        population: Population,
+        *,
+        encoder: AnswerEncoder,
+        z: Tensor,
+        alpha: float = 0.5,
+        discount: float = 1.0,
+    ) -> None:
+        super().__init__(population, alpha=alpha, discount=discount)
+        self.encoder = encoder
+        self.z = z
+
+    @torch.no_grad()
+    def cater(
+        self,
+        segments: TensorDictBase | SegmentBank,
+        answers: TensorDictBase,
+        *,
+        method: Literal["posterior", "lexicase"] = "posterior",
+        mistake: float = 0.05,
+        generator: torch.Generator | None = None,
+    ) -> Catered:
+        """Choose a policy for one rater from a few answers.
+
+        Args:
+            segments: What the answers are about.
+            answers: TensorDict ``[K]`` with ``pair`` and ``answer``; ties and skips are ignored.
+            method: ``"posterior"``: belief ``w_n ~ q(z_n | answers)`` of the encoder, and the one
+                believed in most, the nearest in units of the encoder's standard deviations.
+                ``"lexicase"``: as :meth:`PolicySet.cater`.
+            mistake: Not used.
+            generator: Source of the lexicase draw.
+
+        Raises:
+            ValueError: If no answer is strict, or the arguments are off.
+        """
+        if method != "posterior":
+            return super().cater(
+                segments, answers, method=method, mistake=mistake, generator=generator
+            )
+        comparisons = Comparisons.from_preferences(answers, cases="preference")
+        device = self.population.device
+        bank = segments if isinstance(segments, SegmentBank) else self._bank(segments)
+        said = comparisons.to(device)
+        mean, log_std = self.encoder(bank.to(device), said.preferred[None], said.other[None])
+        distance = ((self.z - mean) / log_std.exp()).square().sum(1).cpu()
+        return Catered(int(distance.argmin()), (-distance / 2).softmax(0))
+
+    def subset(self, members: Sequence[int]) -> Self:
+        """Some of them, in the given order."""
+        chosen = type(self)(
+            self.population.subset(members),
+            encoder=self.encoder,
+            z=self.z[torch.as_tensor(members)],
+            alpha=self.alpha,
+            discount=self.discount,
+        )
+        chosen.origin = [self.origin[member] for member in members]
+        return chosen
+
+
+class VPL:
+    """Trains encoder and policy together, a block of steps for each generation.
+
+    A step draws some raters and some answers of each, and descends the negated evidence lower
+    bound with CPL's likelihood: the CPL loss of these answers at a z drawn from the encoder's
+    belief, plus the belief's divergence from N(0, 1).
+
+    Args:
+        spec: Sizes of the policies.
+        bank: Segments that the comparisons refer to.
+        comparisons: M strict preferences and the case, that is the rater, of each.
+        latent: Length L of z.
+        kl: Weight of the divergence. 1 is the bound itself, under which three groups shared one
+            number of z on two doors and blurred.
+        generations: Generations to come; Adam's step size is held for half of them, then falls
+            linearly to zero.
+        steps: Gradient steps per generation.
+        batch_size: Answers per step; of ``answers`` each, that makes the number of raters.
+        answers: Answers of each rater, drawn with replacement.
+        learning_rate: Adam's step size.
+        alpha: Scale of the scores.
+        conservatism: Lambda of the CPL loss.
+        discount: Per-step discount of the scores.
+        generator: Source of all randomness.
+
+    Attributes:
+        generation: Generations done so far.
+
+    Raises:
+        ValueError: If ``latent`` is below 1 or ``kl`` negative.
+    """
+
+    def __init__(
+        self,
+        spec: PolicySpec,
+        bank: SegmentBank,
+        comparisons: Comparisons,
+        *,
+        latent: int = 8,
+        kl: float = 0.1,
+        generations: int = 100,
+        steps: int = 15,
+        batch_size: int = 256,
+        answers: int = 16,
+        learning_rate: float = 2e-3,
+        alpha: float = 0.5,
+        conservatism: float = 0.9,
+        discount: float = 1.0,
+        generator: torch.Generator,
+    ) -> None:
+        if latent < 1:
+            raise ValueError(f"latent must be at least 1, got {latent}")
+        if not kl >= 0:
+            raise ValueError(f"kl must be at least 0, got {kl}")
+        self.spec, self.bank, self.comparisons = spec, bank, comparisons
+        self.kl, self.steps = kl, steps
+        self.raters, self.answers = max(1, batch_size // answers), answers
+        self.alpha, self.conservatism, self.discount = alpha, conservatism, discount
+        self.generator = generator
+        self.generation = 0
+        device = bank.row.device
+        self.encoder = AnswerEncoder(spec, latent, generator=generator).to(device)
+        conditioned = replace(spec, observation_dim=spec.observation_dim + latent)
+        self.network = build_network(conditioned, generator=generator).to(device)
+        parameters = [*self.encoder.parameters(), *self.network.parameters()]
+        self.optimizer = torch.optim.Adam(parameters, lr=learning_rate)
+        self.schedule = linear_decay(self.optimizer, generations)
+
+    def step(self) -> dict[str, float]:
+        """Run one generation: judge the policies, then train.
+
+        Returns:
+            Scalars to log: ``worst_rater_accuracy`` (10 % quantile over cases of the best policy's
+            accuracy) and ``mean_accuracy``, both as the generation found them, ``loss_cpl`` and
+            ``divergence``.
+        """
+        margin = margins(
+            self.population, self.bank, self.comparisons, alpha=self.alpha, discount=self.discount
+        )
+        passes = margin > 0
+        loss, apart = torch.zeros(2)
+        for _ in range(self.steps):
+            loss, apart = self._losses()
+            bound = loss + self.kl * apart / self.answers
+            self.optimizer.zero_grad(set_to_none=True)
+            bound.backward()  # type: ignore[no-untyped-call]
+            self.optimizer.step()
+        self.schedule.step()
+        self.generation += 1
+        return {
+            "worst_rater_accuracy": rater_accuracy(case_values(passes, self.comparisons)),
+            "mean_accuracy": float(passes.float().mean()),
+            "loss_cpl": float(loss.detach()),
+            "divergence": float(apart.detach()),
+        }
+
+    def _losses(self) -> tuple[Tensor, Tensor]:
+        """CPL loss of an answer, and divergence of a rater's belief, both of a fresh batch."""
+        source, device = self.generator, self.bank.row.device
+        rater = torch.randint(
+            self.comparisons.num_cases, (self.raters,), generator=source, device=device
+        )
+        mine = (self.comparisons.case == rater.unsqueeze(1)).float()
+        index = torch.multinomial(mine, self.answers, replacement=True, generator=source)
+        preferred, other = self.comparisons.preferred[index], self.comparisons.other[index]
+        mean, log_std = self.encoder(self.bank, preferred, other)
+        noise = torch.randn(mean.shape, generator=source, device=device)
+        z = mean + log_std.exp() * noise
+        better, worse = self.scores(preferred, z), self.scores(other, z)
+        loss = cpl_loss(better, worse, conservatism=self.conservatism).mean()
+        return loss, divergence(mean, log_std).mean()
+
+    def scores(self, segment: Tensor, z: Tensor) -> Tensor:
+        """Scores of segments ``[B, K]`` by the policies for z ``[B, L]``, ``[B, K]``."""
+        observation = self.bank.observation[self.bank.row[segment]]
+        wants = z[:, None, None].expand(*observation.shape[:-1], -1)
+        output = self.network(torch.cat([observation, wants], -1))
+        step = self.spec.step_scores(output, self.bank.action[segment])
+        time = torch.arange(step.shape[-1], device=step.device)
+        scores: Tensor = step @ (self.alpha * self.discount ** time.float())
+        return scores
+
+    @torch.no_grad()
+    def beliefs(self) -> Tensor:
+        """The encoder's mean for every rater, from all of the rater's answers, ``[C, L]``."""
+        said = self.comparisons
+        pair = [self.encoder.segments(self.bank, side) for side in (said.preferred, said.other)]
+        embedded = self.encoder.answer(torch.cat(pair, -1)).relu()
+        total = embedded.new_zeros(said.num_cases, embedded.shape[1])
+        total.index_add_(0, said.case, embedded)
+        count = said.case.bincount(minlength=said.num_cases).unsqueeze(1)
+        mean: Tensor = self.encoder.belief(total / count).chunk(2, -1)[0]
+        return mean
+
+    @torch.no_grad()
+    def policies_for(self, z: Tensor) -> Population:
+        """The policies for z ``[N, L]`` as ordinary networks."""
+        weight = self.network.state_dict()
+        seen, wants = weight["0.weight"].split([self.spec.observation_dim, z.shape[1]], 1)
+        own = build_network(self.spec, generator=torch.Generator().manual_seed(0)).to(z.device)
+        own.load_state_dict({**weight, "0.weight": seen})
+        population = Population([own], self.spec).subset([0] * len(z))
+        population.members.data["0", "bias"] += z @ wants.T
+        return population
+
+    @property
+    def population(self) -> Population:
+        """The policies of the set as it is now."""
+        return self.policies_for(self._z())
+
+    def policies(self) -> EncodedPolicySet:
+        """A set of policies for what different raters want."""
+        z = self._z()
+        encoder = copy.deepcopy(self.encoder).requires_grad_(False)
+        return EncodedPolicySet(
+            self.policies_for(z), encoder=encoder, z=z, alpha=self.alpha, discount=self.discount
+        )
+
+    def _z(self) -> Tensor:
+        beliefs = self.beliefs()
+        return beliefs[spread_points(beliefs, _MOST)]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the next generation depends on."""
+        return {
+            "generation": self.generation,
+            "encoder": copy.deepcopy(self.encoder.state_dict()),
+            "network": copy.deepcopy(self.network.state_dict()),
+            # A copy: Adam's own state goes on changing in place.
+            "optimizer": copy.deepcopy(self.optimizer.state_dict()),
+            "epoch": self.schedule.last_epoch,
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from :meth:`state_dict`, bit for bit."""
+        self.generation = int(state["generation"])
+        self.encoder.load_state_dict(state["encoder"])
+        self.network.load_state_dict(state["network"])
+        self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
+        self.schedule.last_epoch = int(state["epoch"])
+        self.generator.set_state(state["generator"].cpu())

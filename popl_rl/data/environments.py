@@ -1,0 +1,148 @@
+"""Environments as a run uses them, and what each offers beyond Gymnasium's interface."""
+
+import fnmatch
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Protocol, cast
+
+import gymnasium
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from popl_rl.config import EnvConfig
+from popl_rl.data.behaviours import Behaviour, random_behaviour, table_behaviour
+from popl_rl.data.tables import Table
+from popl_rl.registry import resolve
+
+__all__ = ["Collect", "World", "behaviour_shares", "build_world", "is_stateless"]
+
+MakeEnv = Callable[[], gymnasium.Env[Any, Any]]
+
+
+class Collect(Protocol):
+    """An environment's own way to collect segments."""
+
+    def __call__(
+        self,
+        num_segments: int,
+        length: int,
+        *,
+        generator: torch.Generator,
+        progress: Callable[[int], None] | None = None,
+    ) -> TensorDictBase:
+        """Segments ``[num_segments, length]``; ``progress`` is told how many there are so far."""
+        ...
+
+
+@dataclass(frozen=True)
+class World:
+    """An environment and what it offers.
+
+    Attributes:
+        make: Builds an environment to act in.
+        make_for_data: Builds an environment to collect segments in.
+        env: One environment, for its spaces and its picture.
+        behaviours: What the data shows.
+        shares: Share of each behaviour in the data.
+        table: Exact model, if the environment exposes one.
+        collect: The environment's own way to collect segments, if it has one, in the place of
+            ``behaviours``.
+    """
+
+    make: MakeEnv
+    make_for_data: MakeEnv
+    env: gymnasium.Env[Any, Any]
+    behaviours: Mapping[str, Behaviour]
+    shares: Mapping[str, float]
+    table: Table | None
+    collect: Collect | None = None
+
+
+def build_world(config: EnvConfig) -> World:
+    """Resolve an environment and read off what it offers.
+
+    An environment is any Gymnasium environment. Three methods are used if it has them:
+    ``transition_table()`` (exact regret labels), ``behaviours()`` (what the data shows: by
+    name, tables ``[S, A]`` of action probabilities or functions; uniformly random otherwise), and
+    ``collect_segments(...)`` (see :class:`Collect`), which collects the data itself.
+
+    Raises:
+        ValueError: If the environment cannot be resolved or built, or ``mixture`` names behaviours
+            that it does not have.
+        TypeError: If it has no behaviours and its actions cannot be drawn at random, see
+            :func:`~popl_rl.data.behaviours.random_behaviour`.
+    """
+    factory = cast("Callable[..., gymnasium.Env[Any, Any]]", resolve("env", config.factory))
+    leading = () if config.id is None else (config.id,)
+
+    def build(options: dict[str, Any]) -> gymnasium.Env[Any, Any]:
+        try:
+            env = factory(*leading, **options)
+        except (TypeError, gymnasium.error.Error) as error:
+            raise ValueError(
+                f"env.factory {config.factory!r} cannot be built with id {config.id!r} and options "
+                f"{options}: {error}"
+            ) from error
+        if not isinstance(env, gymnasium.Env):
+            raise ValueError(
+                f"env.factory {config.factory!r} must return a gymnasium.Env, got {type(env)}"
+            )
+        if isinstance(env.action_space, gymnasium.spaces.Box):
+            # A Gaussian policy's mean knows no bounds. Gymnasium's own ClipAction would hide the
+            # bounds, which random actions need.
+            clip = partial(np.clip, a_min=env.action_space.low, a_max=env.action_space.high)
+            env = gymnasium.wrappers.TransformAction(env, clip, env.action_space)
+        return env
+
+    def make() -> gymnasium.Env[Any, Any]:
+        return build(dict(config.options))
+
+    def make_for_data() -> gymnasium.Env[Any, Any]:
+        return build({**config.options, **config.data_options})
+
+    env = make()
+    inner = env.unwrapped
+    table = inner.transition_table() if hasattr(inner, "transition_table") else None
+    given = inner.behaviours() if hasattr(inner, "behaviours") else {}
+    behaviours = {
+        name: table_behaviour(what) if isinstance(what, Tensor) else what
+        for name, what in given.items()
+    } or {"random": random_behaviour(env.action_space)}
+    shares = behaviour_shares(list(behaviours), config.mixture)
+    collect = None
+    if hasattr(inner, "collect_segments"):
+        collect = cast("Any", make_for_data().unwrapped).collect_segments
+    return World(make, make_for_data, env, behaviours, shares, table, collect)
+
+
+def behaviour_shares(names: Sequence[str], mixture: Mapping[str, float] | None) -> dict[str, float]:
+    """Share of each behaviour in the data.
+
+    Args:
+        names: Behaviours that there are.
+        mixture: Shares by name or by pattern (``"planner/*"``), which the matching behaviours
+            divide equally; None for equal shares of all.
+
+    Raises:
+        ValueError: If a pattern matches nothing.
+    """
+    if mixture is None:
+        return dict.fromkeys(names, 1 / len(names))
+    shares = dict.fromkeys(names, 0.0)
+    for pattern, share in mixture.items():
+        matching = fnmatch.filter(names, pattern)
+        if not matching:
+            raise ValueError(
+                f"env.mixture {pattern!r} matches no behaviour; there are {', '.join(names)}"
+            )
+        for name in matching:
+            shares[name] += share / len(matching)
+    return shares
+
+
+def is_stateless(env: gymnasium.Env[Any, Any]) -> bool:
+    """Whether an environment has a single action, so that one can only judge what is seen."""
+    return isinstance(env.action_space, gymnasium.spaces.Discrete) and env.action_space.n == 1

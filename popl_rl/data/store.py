@@ -1,0 +1,79 @@
+"""Segments that are collected once and read by every run that asks for the same."""
+
+import hashlib
+import json
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from tensordict import TensorDictBase
+
+from popl_rl.storage import locked, save_tensordict
+
+__all__ = ["store_path", "stored"]
+
+
+def store_path(root: Path, name: str, about: Mapping[str, Any]) -> Path:
+    """Folder of what is described by ``about``: other settings, another folder.
+
+    Args:
+        root: Folder of the store.
+        name: What the folder's name begins with; characters unfit for a file become ``-``.
+        about: All that decides about the contents, as JSON can say it.
+    """
+    digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
+    return Path(root) / f"{re.sub(r'[^A-Za-z0-9._-]+', '-', name)}-{digest[:10]}"
+
+
+def stored(path: Path, about: Mapping[str, Any], make: Callable[[], TensorDictBase]) -> Path:
+    """Make what belongs into a store's folder, unless it is there; wait for whoever makes it.
+
+    The folder appears whole or not at all: an interrupted collection leaves nothing behind that
+    another could mistake for data, and starts again.
+
+    Args:
+        path: A folder, as of :func:`store_path`.
+        about: What :func:`store_path` was told; kept in ``about.json``.
+        make: Makes the segments ``[N, T]``.
+
+    Returns:
+        Folder of the segments, for :func:`~popl_rl.storage.load_tensordict`.
+
+    Raises:
+        ValueError: If the folder holds something else.
+    """
+    segments = path / "segments"
+    with locked(path):
+        if path.exists():
+            _check(path, about)
+            return segments
+        data = make()
+        beside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+        try:
+            save_tensordict(data, beside / "whole" / "segments")
+            text = json.dumps(about, indent=2, sort_keys=True)
+            (beside / "whole" / "about.json").write_text(text, encoding="utf-8")
+            (beside / "whole").rename(path)
+        finally:
+            shutil.rmtree(beside, ignore_errors=True)
+    return segments
+
+
+def _check(path: Path, about: Mapping[str, Any]) -> None:
+    """Raise unless a folder says that it holds what is wanted."""
+    record = path / "about.json"
+    try:
+        found = json.loads(record.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(
+            f"{path} is not a folder of stored segments ({error}); remove it to collect them "
+            "again, or choose another data.store"
+        ) from error
+    if found != json.loads(json.dumps(about)):
+        raise ValueError(
+            f"{path} holds segments of other settings, see {record}; remove it to collect them "
+            "again, or choose another data.store"
+        )

@@ -1,0 +1,210 @@
+"""From hypotheses to what they do: roll policies, plan for reward functions, or choose items."""
+
+from collections.abc import Callable
+from typing import Protocol
+
+import torch
+import torch.nn.functional as F  # noqa: N812 - the name everyone knows
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from popl_rl.config import EnvConfig, EvaluationConfig
+from popl_rl.data.bank import SegmentBank
+from popl_rl.data.behaviours import random_behaviour
+from popl_rl.data.environments import World
+from popl_rl.data.rollouts import MASK
+from popl_rl.data.tables import Table, solve
+from popl_rl.evaluation.measures import roll_out
+from popl_rl.evaluation.ppo import reward_of, train_ppo
+from popl_rl.models.hypothesis_set import HypothesisSet
+from popl_rl.models.policies import PolicySpec
+from popl_rl.models.policy_set import PolicySet
+from popl_rl.models.population import Population
+from popl_rl.models.reward_set import RewardSet
+from popl_rl.models.scoring import segment_scores
+from popl_rl.randomness import stream
+
+__all__ = ["Acting", "Choosing", "Optimising", "Planning", "Rolling", "plan"]
+
+
+class Acting(Protocol):
+    """Shows what hypotheses do."""
+
+    def __call__(self, hypotheses: HypothesisSet | None) -> TensorDict:
+        """Episodes ``[P, E, H]`` of every hypothesis; of random actions, ``[1, E, H]``, if None."""
+        ...
+
+
+class Rolling:
+    """Policies act for themselves.
+
+    Args:
+        world: Where to roll out.
+        env: Episode length.
+        config: Episodes, and whether to act greedily.
+        seed: Seed of starts and actions.
+    """
+
+    def __init__(
+        self, world: World, env: EnvConfig, config: EvaluationConfig, *, seed: int
+    ) -> None:
+        self.world, self.env, self.config, self.seed = world, env, config, seed
+
+    def __call__(self, hypotheses: HypothesisSet | None) -> TensorDict:
+        """See :class:`Acting`."""
+        if hypotheses is None:
+            return self._roll(None)
+        if not isinstance(hypotheses, PolicySet):
+            raise TypeError(
+                f"hypotheses must be a PolicySet, got a {type(hypotheses).__name__}; reward "
+                "functions act by planning or after PPO"
+            )
+        return self._roll(hypotheses)
+
+    def _roll(self, policies: PolicySet | Tensor | None) -> TensorDict:
+        return roll_out(
+            self.world.make,
+            policies,
+            episodes=self.config.episodes,
+            max_steps=self.env.max_steps,
+            seed=self.seed,
+            greedy=self.config.greedy,
+            random_action=random_behaviour(self.world.env.action_space),
+        )
+
+
+class Planning(Rolling):
+    """Reward functions act by the exactly optimal policy of their rewards.
+
+    Needs an environment with a transition table.
+    """
+
+    def __call__(self, hypotheses: HypothesisSet | None) -> TensorDict:
+        """See :class:`Acting`."""
+        if not isinstance(hypotheses, RewardSet):
+            return super().__call__(hypotheses)
+        if self.world.table is None:
+            raise ValueError(
+                "the environment exposes no transition table to plan with; set "
+                "evaluation.optimiser=ppo"
+            )
+        return self._roll(plan(hypotheses, self.world.table))
+
+
+class Optimising(Rolling):
+    """Reward functions act by policies that PPO trains on them, once each.
+
+    Args:
+        world: Where to train and roll out.
+        env: Episode length.
+        config: Episodes, and frames of PPO.
+        seed: Seed of everything random.
+        bank: Segments, of whose steps the best is worth 0, as in :func:`plan`.
+        progress: Called with the number of policies trained so far.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        env: EnvConfig,
+        config: EvaluationConfig,
+        *,
+        seed: int,
+        bank: SegmentBank,
+        progress: Callable[[int], None] | None = None,
+    ) -> None:
+        super().__init__(world, env, config, seed=seed)
+        self.bank = bank
+        self.progress = progress
+        self._trained: dict[bytes, Population] = {}
+
+    def __call__(self, hypotheses: HypothesisSet | None) -> TensorDict:
+        """See :class:`Acting`."""
+        if not isinstance(hypotheses, RewardSet):
+            return super().__call__(hypotheses)
+        trained = [self._policy(hypotheses, member) for member in range(len(hypotheses))]
+        networks = [population.network(0) for population in trained]
+        return self._roll(PolicySet(Population(networks, trained[0].spec)))
+
+    def _policy(self, rewards: RewardSet, member: int) -> Population:
+        own = rewards.population.members.data[member].values(True, True)
+        key = b"".join(value.cpu().numpy().tobytes() for value in own)
+        if key not in self._trained:
+            spec = PolicySpec.from_env(self.world.env, hidden=(64, 64))
+            best = rewards.subset([member]).reward(self.bank.observation).max()
+            reward = reward_of(rewards, member)
+            self._trained[key] = train_ppo(
+                self.world.make,
+                lambda observation, action: reward(observation, action) - best,
+                spec,
+                frames=self.config.ppo_frames,
+                max_steps=self.env.max_steps,
+                generator=stream(self.seed, "ppo"),
+            )
+            if self.progress is not None:
+                self.progress(len(self._trained))
+        return self._trained[key]
+
+
+class Choosing:
+    """Hypotheses choose items from menus: what is left to do where actions change nothing.
+
+    An item is a segment; a menu is a few of them. The one with the highest score is chosen, and
+    counts as an episode.
+
+    Args:
+        segments: Items ``[N, T]``.
+        bank: The same items, as hypotheses read them.
+        config: Menus (``episodes``) and items on each (``menu``).
+        seed: Seed of the menus.
+    """
+
+    def __init__(
+        self, segments: TensorDictBase, bank: SegmentBank, config: EvaluationConfig, *, seed: int
+    ) -> None:
+        self.segments, self.bank = segments, bank
+        shape = (config.episodes, config.menu)
+        self.menus = torch.randint(len(bank), shape, generator=stream(seed, "menus"))
+
+    def __call__(self, hypotheses: HypothesisSet | None) -> TensorDict:
+        """See :class:`Acting`; random choice takes each menu's first item."""
+        if hypotheses is None:
+            return self._episodes(self.menus[:, 0].unsqueeze(0))
+        scores = segment_scores(
+            hypotheses.population, self.bank, alpha=hypotheses.alpha, discount=hypotheses.discount
+        )
+        return self.choose(scores.cpu())
+
+    def choose(self, scores: Tensor) -> TensorDict:
+        """Episodes ``[P, E, T]`` of choosers with these scores of all items, ``[P, N]``."""
+        best = scores[:, self.menus].argmax(-1, keepdim=True)
+        return self._episodes(self.menus.expand(len(scores), -1, -1).gather(-1, best).squeeze(-1))
+
+    def _episodes(self, chosen: Tensor) -> TensorDict:
+        episodes: TensorDict = self.segments[chosen]
+        return episodes.set(MASK, torch.ones(episodes.shape, dtype=torch.bool))
+
+
+def plan(rewards: RewardSet, table: Table, *, discount: float = 0.97) -> Tensor:
+    """Optimal policies of reward functions, by value iteration.
+
+    Comparisons of equally long segments say nothing of a constant added to every step, but it
+    decides whether going on pays. It is fixed such that the best of all steps is worth 0 and time
+    costs something anywhere else.
+
+    Args:
+        rewards: P reward functions over discrete actions.
+        table: Exact model of S states and A actions.
+        discount: Discount of the optimal policies, that of the raters' regret.
+
+    Returns:
+        Action probabilities ``[P, S, A]``: one for the best action (the first of equals).
+    """
+    # The last axis of steps is the action; what is observed does not depend on it.
+    seen = rewards.reward(table.steps["observation"][:, 0].to(rewards.population.device)).cpu()
+    policies = []
+    for member in seen:
+        cost = member.double() - float(member.max())
+        advantages, _ = solve(table, cost, discount=discount)
+        policies.append(F.one_hot(advantages.argmax(-1), member.shape[-1]).float())
+    return torch.stack(policies)

@@ -1,0 +1,239 @@
+"""What the policies do, and what that is worth to each hidden group."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from popl_rl.data.rollouts import MASK, lockstep
+from popl_rl.keys import ANSWER, INFO, OBSERVATION, PAIR, Answer
+from popl_rl.models.policy_set import PolicySet
+from popl_rl.raters.groups import RaterGroup
+from popl_rl.raters.pairs import draw_pairs
+from popl_rl.raters.people import Raters
+
+__all__ = [
+    "group_accuracy",
+    "group_returns",
+    "held_out_pairs",
+    "info_rates",
+    "mean_and_peak",
+    "new_rater_answers",
+    "recovery",
+    "roll_out",
+    "steps_to_success",
+    "success_rate",
+]
+
+
+def roll_out(
+    make_env: Callable[[], gymnasium.Env[Any, Any]],
+    policies: PolicySet | Tensor | None,
+    *,
+    episodes: int,
+    max_steps: int,
+    seed: int,
+    greedy: bool = False,
+    random_action: Callable[[TensorDictBase, torch.Generator], Tensor] | None = None,
+) -> TensorDict:
+    """Roll every policy from the same starts, all in lockstep.
+
+    Args:
+        make_env: Builds one environment.
+        policies: P policies, or tables ``[P, S, A]`` of action probabilities in each state
+            (``("info", "next_state")``); None to roll ``random_action`` instead, as one policy.
+        episodes: Episodes E per policy; episode e starts from the same seed for all policies.
+        max_steps: Steps H after which an episode is cut.
+        seed: Seed of the starts and of the sampled actions.
+        greedy: Take the most likely actions instead of sampling.
+        random_action: A behaviour to roll without policies.
+
+    Returns:
+        TensorDict ``[P, E, H]`` as from :func:`~popl_rl.data.rollouts.lockstep`.
+
+    Raises:
+        ValueError: If ``episodes`` or ``max_steps`` is not positive, or there is nothing to roll.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1, got {episodes}")
+    if policies is None and random_action is None:
+        raise ValueError("random_action must be given to roll without policies, got None")
+    device = torch.device("cpu")
+    if isinstance(policies, PolicySet):
+        device = policies.population.device
+    generator = torch.Generator(device).manual_seed(seed)
+    starts = torch.randint(2**31, (episodes,), generator=generator, device=device).tolist()
+    count = 1 if policies is None else len(policies)
+
+    def act(step: TensorDictBase) -> Tensor:
+        if isinstance(policies, Tensor):
+            state = step[INFO, "next_state"].long().view(count, episodes)
+            rows = policies[torch.arange(count).unsqueeze(1), state].flatten(0, 1)
+            return torch.multinomial(rows, 1, generator=generator).squeeze(-1)
+        if policies is not None:
+            observation = step[OBSERVATION].view(count, episodes, -1).to(device)
+            action = policies.act(observation, greedy=greedy, generator=generator)
+            return action.flatten(0, 1).cpu()
+        assert random_action is not None
+        return random_action(step, generator)
+
+    envs = [make_env() for _ in range(count * episodes)]
+    try:
+        flat = lockstep(envs, act, seeds=starts * count, max_steps=max_steps)
+    finally:
+        for env in envs:
+            env.close()
+    return flat.unflatten(0, (count, episodes))
+
+
+def group_returns(episodes: TensorDictBase, groups: Sequence[RaterGroup]) -> Tensor:
+    """Mean undiscounted utility of an episode to each group.
+
+    Args:
+        episodes: ``[P, E, H]``.
+        groups: G groups.
+
+    Returns:
+        ``[P, G]``.
+    """
+    flat = episodes.flatten(0, 1)
+    mask = flat[MASK].float()
+    segment_utility = [(group.step_utility(flat) * mask).sum(1) for group in groups]
+    return torch.stack(segment_utility, -1).view(*episodes.shape[:2], -1).mean(1)
+
+
+def info_rates(episodes: TensorDictBase, key: str) -> dict[int, Tensor]:
+    """Share of episodes in which an integer info ever took each value, ``value -> [P]``."""
+    value, mask = episodes[INFO, key], episodes[MASK]
+    seen = value[mask].unique().tolist()
+    return {int(v): ((value == v) & mask).any(-1).float().mean(-1) for v in seen}
+
+
+def success_rate(episodes: TensorDictBase, key: str) -> Tensor:
+    """Share of episodes in which info ``key`` was ever positive, ``[P]``; NaN without that key."""
+    if (INFO, key) not in episodes.keys(include_nested=True):
+        return torch.full(episodes.shape[:1], float("nan"))
+    done: Tensor = (episodes[INFO, key] > 0) & episodes[MASK]
+    return done.any(-1).float().mean(-1)
+
+
+def steps_to_success(episodes: TensorDictBase, key: str) -> Tensor:
+    """Steps until info ``key`` is positive, mean over the episodes in which it ever is, ``[P]``.
+
+    NaN without that key, or where it never is.
+    """
+    if (INFO, key) not in episodes.keys(include_nested=True):
+        return torch.full(episodes.shape[:1], float("nan"))
+    done = (episodes[INFO, key] > 0) & episodes[MASK]
+    steps = 1 + done.float().argmax(-1).float()
+    reached = done.any(-1)
+    mean: Tensor = (steps * reached).sum(-1) / reached.sum(-1)
+    return mean
+
+
+def mean_and_peak(episodes: TensorDictBase, key: str) -> tuple[Tensor, Tensor]:
+    """Mean and greatest value of an info in an episode, each averaged over episodes, ``[P]``."""
+    value, mask = episodes[INFO, key].float(), episodes[MASK]
+    mean = (value * mask).sum(-1) / mask.sum(-1)
+    peak = value.masked_fill(~mask, -torch.inf).amax(-1)
+    return mean.mean(-1), peak.mean(-1)
+
+
+def recovery(value: float, *, reference: float, oracle: float) -> float:
+    """``(value - reference) / (oracle - reference)``: 1 is the oracle's return.
+
+    0 is the return of what one can do without asking anybody: random actions, or a clone of what
+    the data shows. NaN where the oracle is no better than that, since then nothing was there to
+    recover.
+    """
+    return (value - reference) / (oracle - reference) if oracle > reference else float("nan")
+
+
+def held_out_pairs(
+    segment_utility: Tensor,
+    group: int,
+    *,
+    count: int,
+    start: Tensor | None = None,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:
+    """Fresh pairs on which a group has a strict opinion, and no rater's noise.
+
+    Args:
+        segment_utility: Worth of each stored segment to each group, ``[G, N]``.
+        group: Which group.
+        count: Pairs to draw; those of (nearly) equal worth are dropped.
+        start: Which segments may be compared, ``[N]``; all if None.
+        generator: Source of the pairs.
+
+    Returns:
+        Preferred and other segments, each ``[count or fewer]``.
+    """
+    pair = draw_pairs(segment_utility.shape[1], count, start=start, generator=generator)
+    first, second = segment_utility[group][pair].unbind(-1)
+    strict = (first - second).abs() > 1e-6
+    swap = (first < second)[strict]
+    pair = pair[strict]
+    pair = torch.where(swap.unsqueeze(-1), pair.flip(-1), pair)
+    return pair[:, 0], pair[:, 1]
+
+
+def group_accuracy(scores: Tensor, pairs: Mapping[int, tuple[Tensor, Tensor]]) -> Tensor:
+    """Share of each group's strict pairs that each policy ranks right; a tie is not right.
+
+    Args:
+        scores: Segment scores, ``[P, N]``.
+        pairs: Preferred and other segments of each group.
+
+    Returns:
+        ``[P, G]``.
+    """
+    right = [scores[:, better] > scores[:, worse] for better, worse in pairs.values()]
+    return torch.stack([column.float().mean(1) for column in right], -1)
+
+
+def new_rater_answers(
+    groups: Sequence[RaterGroup],
+    group: int,
+    segment_utility: Tensor,
+    *,
+    answers: int,
+    start: Tensor | None = None,
+    generator: torch.Generator,
+) -> TensorDict:
+    """Strict answers of a new rater of one group, noisy as that group's raters are.
+
+    Args:
+        groups: G groups.
+        group: The new rater's group.
+        segment_utility: ``[G, N]``.
+        answers: Number of strict answers; ties and skips are asked again.
+        start: Which segments may be compared, ``[N]``; all if None.
+        generator: Source of the pairs and of the rater's randomness.
+
+    Returns:
+        TensorDict ``[answers]`` with ``pair`` and ``answer``.
+
+    Raises:
+        ValueError: If the rater keeps answering ties and skips.
+    """
+    person = Raters(tuple(groups), torch.tensor([group]))
+    pairs, replies, found = [], [], 0
+    for _ in range(100):
+        pair = draw_pairs(segment_utility.shape[1], answers, start=start, generator=generator)
+        asked = torch.zeros(answers, dtype=torch.long)
+        reply = person.answer(pair, asked, segment_utility, generator=generator)
+        strict = reply <= Answer.SECOND
+        pairs.append(pair[strict])
+        replies.append(reply[strict])
+        found += int(strict.sum())
+        if found >= answers:
+            data = {PAIR: torch.cat(pairs)[:answers], ANSWER: torch.cat(replies)[:answers]}
+            return TensorDict(data, [answers])
+    raise ValueError(
+        f"a rater of group {groups[group].name!r} gave {found} strict answers to {100 * answers} "
+        "queries, too few to cater to; lower the tie and skip thresholds"
+    )

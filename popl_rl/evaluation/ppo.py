@@ -1,0 +1,336 @@
+"""From a reward function to behaviour where no table can be planned in: PPO, with TorchRL's parts.
+
+A learnt reward is known up to what preferences can tell. Segments of equal length say nothing about
+a constant per step, so where an episode can end, whether ending it pays is not theirs to say: mind
+the offset of a reward learnt from returns before it is maximised there.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import ReplayBuffer, SamplerWithoutReplacement, TensorStorage
+from torchrl.modules import RunningValueNorm, ValueOperator
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from popl_rl.data.rollouts import MASK, lockstep
+from popl_rl.keys import ACTION, OBSERVATION, REWARD
+from popl_rl.models.policies import PolicySpec, build_actor, build_network
+from popl_rl.models.population import Population
+from popl_rl.models.reward_set import RewardSet
+
+__all__ = ["reward_of", "train_ppo"]
+
+#: Maps observations ``[B, O]`` and actions ``[B]`` or ``[B, A]`` to rewards ``[B]``.
+RewardFunction = Callable[[Tensor, Tensor], Tensor]
+_LOG_PROB = "log_prob"
+_ADVANTAGE = "advantage"
+
+
+def reward_of(rewards: RewardSet, member: int) -> RewardFunction:
+    """One reward function of a set, as :func:`train_ppo` takes it.
+
+    Args:
+        rewards: Reward functions.
+        member: Which.
+
+    Returns:
+        Maps observations ``[B, O]`` and actions, ``[B]`` int64 or ``[B, A]`` float, to rewards
+        ``[B]``.
+
+    Raises:
+        IndexError: If there is no such member.
+    """
+    if not 0 <= member < len(rewards):
+        raise IndexError(f"member must be in 0..{len(rewards) - 1}, got {member}")
+    own = rewards.subset([member])
+    device = own.population.device
+
+    def reward(observation: Tensor, action: Tensor) -> Tensor:
+        if action.is_floating_point():
+            joined = torch.cat([observation, action], -1).to(device)
+            return own.reward(joined)[0].squeeze(-1).to(observation.device)
+        table = own.reward(observation.to(device))[0].to(observation.device)
+        return table.gather(-1, action.unsqueeze(-1)).squeeze(-1)
+
+    return reward
+
+
+def train_ppo(
+    make_env: Callable[[], gymnasium.Env[Any, Any]],
+    reward: RewardFunction,
+    spec: PolicySpec,
+    *,
+    frames: int = 100_000,
+    frames_per_batch: int = 2048,
+    num_envs: int = 32,
+    max_steps: int,
+    discount: float = 0.97,
+    gae_lambda: float = 0.95,
+    clip_epsilon: float = 0.2,
+    entropy: float = 0.05,
+    epochs: int = 6,
+    minibatch: int = 512,
+    learning_rate: float = 3e-3,
+    generator: torch.Generator,
+    progress: Callable[[int, float], None] | None = None,
+) -> Population:
+    """Train a policy on a reward function, by PPO with clipped ratios (arXiv 1707.06347).
+
+    Whole episodes are collected in lockstep. One that ends by ``max_steps``, or that the
+    environment truncates, is valued as if it went on; one that the environment terminates is over.
+
+    A learnt reward has an arbitrary scale, so rewards are divided by the running standard deviation
+    of the discounted returns (arXiv 2005.12729, section 3). They are not shifted: a constant per
+    step decides whether it pays to end an episode.
+
+    Args:
+        make_env: Builds one environment. Its own reward is ignored.
+        reward: What is maximised: maps observations ``[B, O]`` and actions ``[B]`` (discrete) or
+            ``[B, A]`` to ``[B]``. It sees actions within the bounds of the action space.
+        spec: Architecture of the policy; it must be that of the environment. The critic has the
+            same hidden layers.
+        frames: Least number of steps in the environments; the last batch is completed.
+        frames_per_batch: Least number of steps between two updates; episodes are completed.
+        num_envs: Environments that advance together.
+        max_steps: Steps after which an episode is cut.
+        discount: Worth of the next step relative to this one.
+        gae_lambda: Decay of the generalised advantage estimate (arXiv 1506.02438): 0 trusts the
+            critic, 1 what happened.
+        clip_epsilon: How far a ratio of probabilities may leave 1 before it gains nothing more.
+        entropy: Weight of the entropy bonus at the start; it falls linearly to 0. Nothing for a
+            continuous policy, whose standard deviation is fixed.
+        epochs: Passes over each batch.
+        minibatch: Steps in each gradient step.
+        learning_rate: Adam's step size at the start; it falls linearly to 0.
+        generator: Source of initial weights, starts, actions and minibatches, on the CPU.
+        progress: Called after each batch with the number of frames so far and the mean
+            undiscounted return of the batch's episodes, in units of ``reward``.
+
+    Returns:
+        A population of one, the trained policy.
+
+    Raises:
+        ValueError: If a number is out of its range, ``spec`` is not that of the environment, or
+            ``reward`` gives another shape or a value that is not finite.
+        TypeError: If the environment's spaces are of another kind than
+            :meth:`~popl_rl.models.policies.PolicySpec.from_env` takes, or ``reward`` gives no
+            floating-point tensor.
+    """
+    _check_numbers(
+        counts={
+            "frames": frames,
+            "frames_per_batch": frames_per_batch,
+            "num_envs": num_envs,
+            "max_steps": max_steps,
+            "epochs": epochs,
+            "minibatch": minibatch,
+        },
+        shares={"discount": discount, "gae_lambda": gae_lambda},
+        sizes={"clip_epsilon": clip_epsilon, "learning_rate": learning_rate},
+    )
+    if not 0 <= entropy < float("inf"):
+        raise ValueError(f"entropy must be 0 or positive, got {entropy}")
+
+    network = build_network(spec, generator=generator)
+    actor = build_actor(spec, network)
+    value = PolicySpec(spec.observation_dim, 1, discrete=False, hidden=spec.hidden)
+    critic = ValueOperator(build_network(value, generator=generator), in_keys=[OBSERVATION])
+    advantage = GAE(gamma=discount, lmbda=gae_lambda, value_network=critic, deactivate_vmap=True)
+    loss = ClipPPOLoss(
+        actor,
+        critic,
+        clip_epsilon=clip_epsilon,
+        entropy_coeff=entropy,
+        critic_coeff=0.5,
+        loss_critic_type="l2",
+        log_explained_variance=False,
+        functional=False,
+    )
+    loss.set_keys(sample_log_prob=_LOG_PROB)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=learning_rate, eps=1e-5, fused=True)
+    returns = RunningValueNorm(shape=1, epsilon=1e-16)
+    envs = [_Ending(make_env()) for _ in range(num_envs)]
+    try:
+        _check_spec(spec, envs[0])
+        act = partial(_act, spec, network, generator=generator)
+        done = 0
+        while done < frames:
+            rolled: list[TensorDict] = []
+            while sum(map(len, rolled)) < frames_per_batch:
+                rolled.append(_roll(envs, act, max_steps=max_steps, generator=generator))
+            batch: TensorDict = TensorDict.cat(rolled)
+            action = _clip(envs[0].action_space, batch[ACTION])
+            gain = _rewards(reward, batch[OBSERVATION], action)
+            over = batch["next", "done"].squeeze(-1)
+            returns.update(_running_returns(gain, over, discount))
+            batch["next", REWARD] = gain.unsqueeze(-1) / returns.scale()
+            with torch.no_grad():
+                advantage(batch)
+                batch[_LOG_PROB] = actor.get_dist(batch).log_prob(batch[ACTION])
+            # Here and not by the loss, whose last minibatch may be a single step.
+            centred = batch[_ADVANTAGE] - batch[_ADVANTAGE].mean()
+            batch[_ADVANTAGE] = centred / centred.square().mean().sqrt().clamp(min=1e-8)
+            left = 1 - done / frames
+            loss.entropy_coeff.fill_(entropy * left)
+            for group in optimizer.param_groups:
+                group["lr"] = learning_rate * left
+            _update(loss, optimizer, batch, epochs, minibatch, generator)
+            done += len(batch)
+            if progress is not None:
+                progress(done, float(gain.sum() / over.sum()))
+    finally:
+        for env in envs:
+            env.close()
+    return Population([network], spec)
+
+
+class _Ending(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Keeps how an episode ended, which lockstep does not record, and keeps actions in bounds."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.last: Any = None
+        self.terminated = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        observation, _ = self.env.reset(seed=seed, options=options)
+        return observation, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        space = self.env.action_space
+        if isinstance(space, gymnasium.spaces.Box):
+            action = np.clip(action, space.low, space.high)
+        self.last, _, self.terminated, truncated, _ = self.env.step(action)
+        # A reward that is not used, and no info, which would be copied into every step.
+        return self.last, 0.0, self.terminated, truncated, {}
+
+
+def _clip(space: gymnasium.Space[Any], action: Tensor) -> Tensor:
+    """Actions as an :class:`_Ending` carries them out; a Gaussian policy knows no bounds."""
+    if not isinstance(space, gymnasium.spaces.Box):
+        return action
+    return action.clamp(torch.from_numpy(space.low), torch.from_numpy(space.high)).to(action.dtype)
+
+
+def _check_numbers(
+    *, counts: Mapping[str, int], shares: Mapping[str, float], sizes: Mapping[str, float]
+) -> None:
+    for name, count in counts.items():
+        if count < 1:
+            raise ValueError(f"{name} must be at least 1, got {count}")
+    for name, share in shares.items():
+        if not 0 <= share <= 1:
+            raise ValueError(f"{name} must be in [0, 1], got {share}")
+    for name, size in sizes.items():
+        if not 0 < size < float("inf"):
+            raise ValueError(f"{name} must be positive, got {size}")
+
+
+def _check_spec(spec: PolicySpec, env: gymnasium.Env[Any, Any]) -> None:
+    fits = PolicySpec.from_env(env, hidden=spec.hidden, action_std=spec.action_std)
+    if fits != spec:
+        raise ValueError(
+            f"spec must be that of the environment, {fits}, got {spec}; use PolicySpec.from_env"
+        )
+
+
+@torch.no_grad()
+def _act(
+    spec: PolicySpec, network: nn.Module, step: TensorDictBase, *, generator: torch.Generator
+) -> Tensor:
+    """Sample actions; TorchRL's actors draw from the global generator only."""
+    output: Tensor = network(step[OBSERVATION])
+    if spec.discrete:
+        return torch.multinomial(output.softmax(-1), 1, generator=generator).squeeze(-1)
+    return output + spec.action_std * torch.randn(output.shape, generator=generator)
+
+
+def _roll(
+    envs: Sequence[_Ending],
+    act: Callable[[TensorDictBase], Tensor],
+    *,
+    max_steps: int,
+    generator: torch.Generator,
+) -> TensorDict:
+    """Steps ``[S]`` of one episode in each environment, one episode after the other."""
+    seeds = torch.randint(2**31, (len(envs),), generator=generator).tolist()
+    episodes = lockstep(envs, act, seeds=seeds, max_steps=max_steps)
+    mask = episodes[MASK]
+    rows, last = torch.arange(len(envs)), mask.sum(1) - 1
+    # What follows a step is seen at the next one, but for the last, whose outcome is elsewhere.
+    following = episodes[OBSERVATION].roll(-1, 1)
+    following[rows, last] = torch.stack(
+        [torch.as_tensor(env.last, dtype=following.dtype) for env in envs]
+    )
+    done, terminated = torch.zeros(2, *mask.shape, 1, dtype=torch.bool)
+    done[rows, last] = True
+    terminated[rows, last, 0] = torch.tensor([env.terminated for env in envs])
+    episodes = episodes.select(OBSERVATION, ACTION)
+    episodes["next"] = TensorDict(
+        {OBSERVATION: following, "done": done, "terminated": terminated}, episodes.batch_size
+    )
+    return episodes[mask]
+
+
+@torch.no_grad()
+def _rewards(reward: RewardFunction, observation: Tensor, action: Tensor) -> Tensor:
+    gain = reward(observation, action)
+    if not isinstance(gain, Tensor) or not gain.is_floating_point():
+        kind = gain.dtype if isinstance(gain, Tensor) else type(gain).__name__
+        raise TypeError(
+            f"reward must give a floating-point tensor, got {kind}; call .float() on it"
+        )
+    if gain.shape != action.shape[:1]:
+        raise ValueError(
+            f"reward must give one value for each step, shape {list(action.shape[:1])}, got "
+            f"{list(gain.shape)}"
+        )
+    if not bool(gain.isfinite().all()):
+        raise ValueError(
+            f"reward must give finite values, got {int((~gain.isfinite()).sum())} NaN or infinite "
+            f"ones in {len(gain)} steps; look at the network it comes from"
+        )
+    return gain.float()
+
+
+def _running_returns(gain: Tensor, done: Tensor, discount: float) -> Tensor:
+    """Discounted sum of an episode's rewards up to each step, ``[S, 1]``."""
+    sums, total = [], 0.0
+    for value, ends in zip(gain.tolist(), done.tolist(), strict=True):
+        total = discount * total + value
+        sums.append(total)
+        total = 0.0 if ends else total
+    return torch.tensor(sums).unsqueeze(-1)
+
+
+def _update(
+    loss: ClipPPOLoss,
+    optimizer: torch.optim.Optimizer,
+    batch: TensorDict,
+    epochs: int,
+    minibatch: int,
+    generator: torch.Generator,
+) -> None:
+    buffer = ReplayBuffer(
+        storage=TensorStorage(batch.exclude("next")),
+        sampler=SamplerWithoutReplacement(),
+        batch_size=minibatch,
+        generator=generator,
+    )
+    for _ in range(epochs):
+        for some in buffer:
+            terms = loss(some)
+            total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
+            optimizer.zero_grad()
+            total.backward()
+            nn.utils.clip_grad_norm_(loss.parameters(), 0.5)
+            optimizer.step()

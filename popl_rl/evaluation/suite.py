@@ -1,0 +1,69 @@
+"""What a benchmark compares: scenarios, methods and the axes on which scenarios lie."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from popl_rl.evaluation.method_names import method_name
+
+__all__ = ["Scenario", "Suite"]
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Conditions that methods are compared under.
+
+    Attributes:
+        name: Name, also of a folder.
+        overrides: Overrides of ``popl-train``.
+        methods: Names of the methods that it runs.
+        at: Value on each axis of the suite that it lies on.
+        data_of: Scenario whose data and baselines it uses; None to make its own.
+    """
+
+    name: str
+    overrides: tuple[str, ...]
+    methods: tuple[str, ...]
+    at: Mapping[str, float | str]
+    data_of: str | None = None
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Scenarios and methods, see the top of ``configs/suites/smoke.yaml``.
+
+    Attributes:
+        name: Name.
+        scenarios: Scenarios by name.
+        methods: Overrides of ``popl-train`` by name of a method.
+        overrides: Overrides of every cell.
+        seeds: How many seeds, where the command does not say.
+    """
+
+    name: str
+    scenarios: Mapping[str, Scenario]
+    methods: Mapping[str, tuple[str, ...]]
+    overrides: tuple[str, ...] = ()
+    seeds: int = 5
+
+    def axes(self) -> dict[str, dict[str, float | str]]:
+        """Value of each scenario on each axis, in the order of numeric values."""
+        found: dict[str, dict[str, float | str]] = {}
+        for scenario in self.scenarios.values():
+            for axis, value in scenario.at.items():
+                found.setdefault(axis, {})[scenario.name] = value
+        for axis, points in found.items():
+            if not any(isinstance(value, str) for value in points.values()):
+                found[axis] = dict(sorted(points.items(), key=lambda point: float(point[1])))
+        return found
+
+    def label(self, method: str) -> str:
+        """Name to print for a method of the results."""
+        name = method.removesuffix("_lexicase")
+        if method not in self.methods and name in self.methods:
+            return f"{name}, by lexicase"
+        return method if method in self.methods else method_name(method)
+
+    def ordered(self, found: Sequence[str]) -> list[str]:
+        """Methods of the results in the order to show them in: the suite's own first."""
+        own = [name for method in self.methods for name in (method, f"{method}_lexicase")]
+        return [name for name in own if name in found] + [n for n in found if n not in own]

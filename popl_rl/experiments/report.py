@@ -1,0 +1,128 @@
+"""What came out of a run, as a table in the terminal and as ``report.md``."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import pandas as pd
+from rich.table import Table
+from rich.text import Text
+
+from popl_rl.evaluation.method_names import method_name
+from popl_rl.evaluation.statistics import in_order, interval, require_columns, worst_recovery
+from popl_rl.experiments.markdown import markdown_table
+
+__all__ = ["markdown", "results_table"]
+
+_MEASURES = ("return", "recovery", "success", "accuracy")
+_SHARES = ("success", "accuracy")
+
+_WORDS = {
+    "group": "raters who want the same. No method but the oracle is told who belongs to which.",
+    "POPL (catered)": "the policy that the policy set offers to a new rater of the group after a "
+    "few answers.",
+    "oracle": "trained on the answers of this group alone, so it knows what POPL has to find out.",
+    "return": "sum over an episode of what the group's raters value, averaged over episodes.",
+    "recovery": "(return − floor) / (oracle's return − floor): 1 is as good as the oracle, 0 as "
+    "bad as random actions, or as what `evaluation.reference` names in their place. The worst "
+    "group's recovery is what counts: a method that serves the majority alone has a low one.",
+    "success": "share of episodes that fulfil the task, whatever the group wants besides.",
+    "accuracy": "share of pairs of segments, not used in training, that the policy ranks as the "
+    "group does; 50 % is guessing.",
+}
+
+
+def results_table(results: pd.DataFrame) -> Table:
+    """Lay out results for a terminal: a row for each method and group.
+
+    Args:
+        results: Tidy rows ``method, group, measure, value``. Several rows of a method, group and
+            measure, such as seeds, are shown as their mean and its 95 % interval.
+
+    Returns:
+        Columns return, recovery, success and accuracy, with a dash for what was not measured.
+
+    Raises:
+        ValueError: If a column is missing.
+    """
+    table = Table("method", "raters who want", title="How well is each group served?")
+    for measure in _MEASURES:
+        table.add_column(measure, justify="right")
+    previous = None
+    for method, group, *cells in _rows(results):
+        if previous not in (None, method):
+            table.add_section()
+        table.add_row(method if method != previous else "", Text(group), *cells)
+        previous = method
+    return table
+
+
+def markdown(
+    results: pd.DataFrame, *, title: str, about: Mapping[str, Any], figures: Sequence[Path]
+) -> str:
+    """Write the text of a report.
+
+    Args:
+        results: Tidy rows ``method, group, measure, value``.
+        title: Heading.
+        about: What was run, such as environment, groups and seed.
+        figures: Pictures, relative to the folder of the report.
+
+    Returns:
+        Markdown: what was run, the results, the pictures, and what the words mean.
+
+    Raises:
+        ValueError: If a column is missing or a path in ``figures`` is absolute.
+    """
+    absolute = [str(figure) for figure in figures if figure.is_absolute()]
+    if absolute:
+        raise ValueError(
+            f"figures must be relative to the report's folder, so that it can be moved, got "
+            f"{absolute}; use figure.relative_to(run_dir)"
+        )
+    worst = [
+        f"{method_name(method)} **{value:z.2f}**"
+        for method, value in worst_recovery(results).items()
+        if method not in ("oracle", "random")  # 1 and 0 by definition
+    ]
+    blocks = [f"# {title}"]
+    if about:
+        blocks.append(markdown_table(["", ""], [[key, value] for key, value in about.items()]))
+    blocks.append("## How well is each group served?")
+    if worst:
+        blocks.append(f"Recovery of the worst-served group: {', '.join(worst)}.")
+    head = ["method", "raters who want", *_MEASURES]
+    blocks.append(markdown_table(head, _rows(results), right=len(_MEASURES)))
+    blocks.append("Every number measured is in `results.csv`.")
+    for figure in figures:
+        name = figure.stem.replace("_", " ")
+        blocks.append(f"![{name}]({quote(figure.as_posix())})")
+    blocks.append("## Words")
+    blocks.append("\n".join(f"- **{word}**: {meaning}" for word, meaning in _WORDS.items()))
+    return "\n\n".join(blocks) + "\n"
+
+
+def _rows(results: pd.DataFrame) -> Iterator[list[str]]:
+    require_columns(results, ["method", "group", "measure", "value"])
+    for method in in_order(results):
+        of_method = results[results["method"] == method]
+        for group in of_method["group"].unique():
+            of_group = of_method[of_method["group"] == group]
+            values = {name: rows["value"] for name, rows in of_group.groupby("measure")}
+            if not set(values) & set(_MEASURES):
+                continue
+            cells = [_cell(name, values.get(name, pd.Series(dtype=float))) for name in _MEASURES]
+            yield [method_name(method), str(group), *cells]
+
+
+def _cell(measure: str, values: pd.Series) -> str:
+    numbers = values.dropna().to_numpy(dtype=float)
+    if not len(numbers):
+        return "–"
+    scale, decimals, unit = (100, 0, " %") if measure in _SHARES else (1, 2, "")
+    mean, half = interval(numbers)
+    text = f"{scale * mean:z.{decimals}f}"
+    if len(numbers) > 1:
+        text += f" ± {scale * half:.{decimals}f}"
+    return text.replace("-", "−") + unit

@@ -1,0 +1,169 @@
+"""The run folder: what was run, with what, and what came out of it.
+
+Files are written beside their place and renamed into it, so that whoever reads a run folder, or
+continues a killed run, never finds half a file. Rows of ``metrics.csv`` are the exception: they
+are appended, and a torn last one is dropped when the file is opened again.
+"""
+
+import importlib.metadata
+import json
+import platform
+import re
+import shlex
+import subprocess
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from popl_rl.experiments.loggers import Progress, RunLogger, make_logger
+from popl_rl.storage import write_atomic, write_json
+
+__all__ = [
+    "Progress",
+    "RunLogger",
+    "create_run_dir",
+    "load_config",
+    "make_logger",
+    "save_config",
+    "write_metadata",
+]
+
+_PACKAGES = (
+    "popl_rl",
+    "torch",
+    "torchrl",
+    "tensordict",
+    "gymnasium",
+    "minigrid",
+    "metaworld",
+    "wandb",
+    "numpy",
+)
+
+
+def create_run_dir(path: Path | None, *, name: str, resume: bool = False) -> Path:
+    """Make the folder of a run, or find the one to continue.
+
+    Args:
+        path: The folder; None for ``runs/<date-time>-<name>`` under the current folder.
+        name: Names the run where ``path`` is None; characters unfit for a folder become ``-``.
+        resume: Continue the run in ``path`` instead of starting one.
+
+    Returns:
+        The folder, which exists.
+
+    Raises:
+        FileExistsError: If ``path`` is there already and holds something, and ``resume`` is off.
+        FileNotFoundError: If ``resume`` is on and ``path`` holds no run.
+        ValueError: If ``resume`` is on without a ``path``.
+    """
+    if resume:
+        if path is None:
+            raise ValueError("path must name the run to resume, got None; give resume=<dir>")
+        if not (path / "config.yaml").is_file():
+            raise FileNotFoundError(
+                f"no run to resume in {path}: it has no config.yaml; resume must name the folder "
+                "of a run, such as runs/20260131-120000-popl"
+            )
+        return path
+    if path is None:
+        stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+        base = Path("runs", f"{stamp}-" + re.sub(r"[^\w.-]+", "-", name))
+        # Runs of one sweep can start within the same second.
+        for folder in [base, *(base.with_name(f"{base.name}-{i}") for i in range(2, 1000))]:
+            try:
+                folder.mkdir(parents=True)
+            except FileExistsError:
+                continue
+            return folder
+        raise FileExistsError(f"{base} and 998 folders like it exist; choose run_dir=<dir>")
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise FileExistsError(
+            f"run_dir {path} exists and is not empty; choose another run_dir, or continue that run "
+            f"with resume={path}"
+        )
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def save_config(run_dir: Path, cfg: Any) -> None:
+    """Write ``config.yaml``: a DictConfig, dataclass or dict, with every reference resolved."""
+    if not OmegaConf.is_config(cfg):
+        cfg = OmegaConf.create(cfg)
+    write_atomic(run_dir / "config.yaml", OmegaConf.to_yaml(cfg, resolve=True))
+
+
+def load_config(run_dir: Path) -> DictConfig:
+    """Read ``config.yaml`` of a run.
+
+    Raises:
+        FileNotFoundError: If the folder has none.
+        ValueError: If it is not a mapping in YAML.
+    """
+    path = run_dir / "config.yaml"
+    if not path.is_file():
+        raise FileNotFoundError(f"{run_dir} has no config.yaml; give the folder of a run")
+    try:
+        cfg = OmegaConf.load(path)
+    except Exception as error:  # OmegaConf passes on whatever its YAML reader raises
+        raise ValueError(
+            f"{path} is not valid YAML ({error}); restore it or start again"
+        ) from error
+    if not isinstance(cfg, DictConfig):
+        raise ValueError(f"{path} must be a mapping of options to values, got {cfg!r}")
+    return cfg
+
+
+def write_metadata(run_dir: Path, *, command: Sequence[str]) -> None:
+    """Write ``metadata.json``: versions, git commit, platform, device, command, start time.
+
+    A resumed run keeps the entry of its first start and adds one to the list ``resumed``.
+
+    Args:
+        run_dir: Folder of the run.
+        command: The program and its arguments, as in ``sys.argv``.
+    """
+    entry: dict[str, Any] = {
+        "started": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "command": shlex.join(command),
+        "git": _git(Path(__file__).parents[1]),
+        "platform": platform.platform(),
+        "device": torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
+        "versions": {
+            "python": platform.python_version(),
+            **{package: _version(package) for package in _PACKAGES},
+        },
+    }
+    path = run_dir / "metadata.json"
+    if path.exists():
+        first = json.loads(path.read_text(encoding="utf-8"))
+        first.setdefault("resumed", []).append(entry)
+        entry = first
+    write_json(path, entry)
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _git(checkout: Path) -> dict[str, Any] | None:
+    def ask(*question: str) -> str:
+        command = ["git", "-C", str(checkout), *question]
+        return subprocess.run(
+            command, capture_output=True, text=True, check=True, timeout=10
+        ).stdout.strip()
+
+    try:
+        # An installed package may lie inside somebody else's checkout.
+        if Path(ask("rev-parse", "--show-toplevel")).resolve() != checkout.resolve():
+            return None
+        return {"commit": ask("rev-parse", "HEAD"), "dirty": bool(ask("status", "--porcelain"))}
+    except (OSError, subprocess.SubprocessError):
+        return None

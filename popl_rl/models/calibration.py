@@ -1,0 +1,42 @@
+"""How firmly a set's scores should be believed, when it is catered to a rater."""
+
+import torch
+from torch import Tensor
+
+from popl_rl.data.comparisons import Comparisons
+from popl_rl.models.preference_likelihood import MISTAKE, leave_one_out, log_likelihood
+
+__all__ = ["SCALES", "fit_scale"]
+
+#: Scales that are tried: powers of two from an eighth to 32.
+SCALES = tuple(2.0**power for power in range(-3, 6))
+
+
+def fit_scale(margin: Tensor, comparisons: Comparisons, *, mistake: float = MISTAKE) -> float:
+    """Scale of the margins under which catering predicts raters' answers best.
+
+    Members are trained with scores of some scale, but what a rater's answers tell of two members
+    depends on it: too small, and whoever has the largest margins wins with fewer answers on its
+    side; too large, and the number of answers is all that counts. So a scale is fitted, as one
+    would fit the raters' rationality: each answer is predicted by the member that the rater's
+    other answers speak for, and the likelihood of all answers is maximised over :data:`SCALES`.
+
+    Args:
+        margin: Margins of the N members on M comparisons, ``[N, M]``.
+        comparisons: The comparisons, a case for each rater.
+        mistake: Chance that an answer is a slip, in [0, 0.5), as in catering.
+
+    Returns:
+        The factor for the margins; 1 if there is nothing to choose, since there is a single member
+        or no rater has more than one answer.
+
+    Raises:
+        ValueError: If ``mistake`` is outside [0, 0.5).
+    """
+    if len(margin) == 1 or comparisons.num_cases == len(comparisons):
+        return 1.0
+    values = [
+        leave_one_out(log_likelihood(scale * margin, mistake), comparisons).mean()
+        for scale in SCALES
+    ]
+    return SCALES[int(torch.stack(values).argmax())]

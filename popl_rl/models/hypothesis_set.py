@@ -1,0 +1,254 @@
+"""The result of training: a set of hypotheses, and choosing from it for one person or for all."""
+
+import json
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import ClassVar, Literal, Self, cast
+
+import torch
+import torch.nn.functional as F  # noqa: N812 - the name everyone knows
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from popl_rl.data.bank import SegmentBank
+from popl_rl.data.comparisons import Comparisons
+from popl_rl.models.policies import PolicySpec, build_network
+from popl_rl.models.population import Population
+from popl_rl.models.preference_likelihood import MISTAKE, log_likelihood
+from popl_rl.models.reward_functions import RewardSpec
+from popl_rl.models.scoring import case_values, margins
+from popl_rl.selection.lexicase import lexicase_selection
+from popl_rl.storage import load_tensordict, save_tensordict
+
+__all__ = ["Catered", "HypothesisSet"]
+
+
+@dataclass(frozen=True)
+class Catered:
+    """A choice from a set for one rater.
+
+    Attributes:
+        member: The chosen hypothesis.
+        weights: Belief in each hypothesis, ``[N]``, summing to 1.
+    """
+
+    member: int
+    weights: Tensor
+
+
+class HypothesisSet:
+    """Hypotheses about what people want, of which every hidden group should find its own.
+
+    Args:
+        population: The hypotheses.
+        alpha: Scale of their scores, as trained.
+        discount: Per-step discount of their scores.
+
+    Attributes:
+        origin: Member of the trained population that each one is; empty if it is none of them.
+    """
+
+    folder: ClassVar[str]  #: of a run, in which it is kept
+    _kind: ClassVar[str]
+    _spec: ClassVar[type[PolicySpec] | type[RewardSpec]]
+
+    def __init__(
+        self, population: Population, *, alpha: float = 0.5, discount: float = 1.0
+    ) -> None:
+        self.population = population
+        self.alpha = alpha
+        self.discount = discount
+        self.origin = list(range(len(population)))
+
+    def distinct(self, bank: SegmentBank, comparisons: Comparisons) -> Self:
+        """Keep one member for each distinct behaviour (pass or not, on every comparison)."""
+        passes = self._margins(bank, comparisons) > 0
+        inverse = torch.unique(passes, dim=0, return_inverse=True)[1].tolist()
+        first = sorted({behaviour: inverse.index(behaviour) for behaviour in inverse}.values())
+        return self.subset(first)
+
+    def __len__(self) -> int:
+        return len(self.population)
+
+    def effective_number(self, bank: SegmentBank, comparisons: Comparisons) -> float:
+        """How many clearly different hypotheses there are, between 1 and ``len(self)``.
+
+        The similarity-sensitive diversity of order 2 (Leinster and Cobbold, 2012), ``1 / sum_ij
+        p_i Z_ij p_j`` with equal shares p; two members are as similar as the agreement of their
+        passes exceeds chance, ``Z = max(0, 2 agreement - 1)``.
+        """
+        sign = (self._margins(bank, comparisons) > 0).float() * 2 - 1
+        similarity = (sign @ sign.T / sign.shape[1]).clamp(min=0)
+        return float(1 / similarity.mean())
+
+    @staticmethod
+    def _bank(segments: TensorDictBase) -> SegmentBank:
+        """Segments as hypotheses of this kind read them."""
+        return SegmentBank.from_segments(segments)
+
+    def _margins(self, segments: TensorDictBase | SegmentBank, comparisons: Comparisons) -> Tensor:
+        bank = segments if isinstance(segments, SegmentBank) else self._bank(segments)
+        pair = torch.stack([comparisons.preferred, comparisons.other])
+        if pair.numel() < len(bank):
+            # A few answers are about a few segments: score no others.
+            used, pair = pair.unique(return_inverse=True)
+            bank = bank.subset(used)
+            comparisons = replace(comparisons, preferred=pair[0], other=pair[1])
+        device = self.population.device
+        return margins(
+            self.population,
+            bank.to(device),
+            comparisons.to(device),
+            alpha=self.alpha,
+            discount=self.discount,
+        )
+
+    def cater(
+        self,
+        segments: TensorDictBase | SegmentBank,
+        answers: TensorDictBase,
+        *,
+        method: Literal["posterior", "lexicase"] = "posterior",
+        mistake: float = MISTAKE,
+        generator: torch.Generator | None = None,
+    ) -> Catered:
+        """Choose a hypothesis for one rater from a few answers.
+
+        Args:
+            segments: What the answers are about.
+            answers: TensorDict ``[K]`` with ``pair`` and ``answer``; ties and skips are ignored.
+            method: ``"posterior"``: belief ``w_n ~ prod_k p(answer_k | Delta_nk)`` with ``p = (1 -
+                mistake) sigmoid(Delta) + mistake sigmoid(-Delta)``, and the one believed in
+                most. ``"lexicase"``: one lexicase selection over the answers, as in the POPL
+                paper; needs ``generator``.
+            mistake: Chance of a slip, which keeps single answers from ruling a policy out.
+            generator: Source of the lexicase draw.
+
+        Raises:
+            ValueError: If no answer is strict, or the arguments are off.
+        """
+        comparisons = Comparisons.from_preferences(answers, cases="preference")
+        margin = self._margins(segments, comparisons).cpu()
+        if method == "posterior":
+            log_weight = log_likelihood(margin, mistake).sum(1)
+            return Catered(int(log_weight.argmax()), log_weight.softmax(0))
+        if method == "lexicase":
+            if generator is None:
+                raise ValueError("generator must be given for lexicase catering")
+            member = int(lexicase_selection(margin > 0, 1, generator=generator))
+            return Catered(member, F.one_hot(torch.tensor(member), len(self)).float())
+        raise ValueError(f"method must be 'posterior' or 'lexicase', got {method!r}")
+
+    def fair(
+        self,
+        segments: TensorDictBase | SegmentBank,
+        answers: TensorDictBase,
+        *,
+        quantile: float = 0.1,
+    ) -> int:
+        """The one hypothesis that does best by the raters it serves worst.
+
+        Args:
+            segments: What the answers are about.
+            answers: TensorDict ``[M]`` with ``pair``, ``answer`` and ``rater``.
+            quantile: Quantile over raters of its accuracy that is maximised; 0.1 as in the
+                POPL paper, 0 for the minimum.
+
+        Raises:
+            ValueError: If ``quantile`` is outside [0, 1] or no answer is strict.
+        """
+        if not 0 <= quantile <= 1:
+            raise ValueError(f"quantile must be in [0, 1], got {quantile}")
+        comparisons = Comparisons.from_preferences(answers, cases="rater")
+        values = case_values(self._margins(segments, comparisons).cpu() > 0, comparisons)
+        return int(values.quantile(quantile, dim=1).argmax())
+
+    def save(self, path: Path | str) -> None:
+        """Write the set as tensors and JSON; nothing is left half-written.
+
+        Raises:
+            FileExistsError: If ``path`` exists.
+        """
+        path = Path(path)
+        if path.exists():
+            raise FileExistsError(f"{path} exists; remove it or choose another path")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        beside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+        try:
+            whole = beside / "set"
+            whole.mkdir()
+            population = self.population.plain()
+            save_tensordict(population.members.data, whole / "members")
+            trunk = {name: value.tolist() for name, value in population.trunk.state_dict().items()}
+            about = {
+                "format": f"popl_rl.{self._kind}_set/1",
+                "members": len(self),
+                "spec": asdict(cast("PolicySpec | RewardSpec", population.spec)),
+                "evolve": population.evolve,
+                "alpha": self.alpha,
+                "discount": self.discount,
+                "origin": self.origin,
+                "trunk": trunk,
+            }
+            (whole / f"{self._kind}_set.json").write_text(json.dumps(about))
+            whole.rename(path)
+        finally:
+            shutil.rmtree(beside, ignore_errors=True)
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            FileNotFoundError: If there is no set of this kind at ``path``.
+            ValueError: If it is truncated, damaged, or something else.
+        """
+        path = Path(path)
+        about_path = path / f"{cls._kind}_set.json"
+        if not about_path.is_file():
+            raise FileNotFoundError(
+                f"no {cls._kind} set at {path}: expected the folder {cls.folder!r} of a finished "
+                "run"
+            )
+        try:
+            about = json.loads(about_path.read_text())
+            if about["format"] != f"popl_rl.{cls._kind}_set/1":
+                raise ValueError(f"unknown format {about['format']!r}")
+            spec = cls._spec(**{**about["spec"], "hidden": tuple(about["spec"]["hidden"])})
+            generator = torch.Generator().manual_seed(0)
+            networks = [build_network(spec, generator=generator) for _ in range(about["members"])]
+            population = Population(networks, spec, evolve=about["evolve"])
+            trunk = {name: torch.tensor(value) for name, value in about["trunk"].items()}
+            population.trunk.load_state_dict(trunk)
+            members = load_tensordict(path / "members")
+            expected = population.members.data
+            for key in expected.keys(True, True):
+                if members[key].shape != expected[key].shape:
+                    raise ValueError(f"{key} has shape {tuple(members[key].shape)}")
+            expected.update_(members)
+            loaded = cls(population, alpha=float(about["alpha"]), discount=float(about["discount"]))
+            loaded.origin = [int(member) for member in about["origin"]]
+        except (
+            AttributeError,
+            FileNotFoundError,
+            KeyError,
+            RuntimeError,
+            TypeError,
+            ValueError,
+        ) as error:
+            raise ValueError(
+                f"{path} is not readable as a {cls._kind} set ({error}); it is truncated or was "
+                "written by something else; train again or restore the folder"
+            ) from error
+        return loaded
+
+    def subset(self, members: Sequence[int]) -> Self:
+        """Some of them, in the given order."""
+        chosen = type(self)(
+            self.population.subset(members), alpha=self.alpha, discount=self.discount
+        )
+        chosen.origin = [self.origin[member] for member in members] if self.origin else []
+        return chosen

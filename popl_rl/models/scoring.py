@@ -1,0 +1,229 @@
+"""Scores of segments, margins of comparisons and values of cases in the eyes of a population."""
+
+from collections.abc import Callable, Iterator
+
+import torch
+import torch.nn.functional as F  # noqa: N812 - the name everyone knows
+from torch import Tensor
+
+from popl_rl.data.bank import SegmentBank
+from popl_rl.data.comparisons import Comparisons
+from popl_rl.models.layers import apply_layers, change_layers, some_layers
+from popl_rl.models.population import Population
+from popl_rl.models.reward_functions import RewardSpec
+
+__all__ = ["case_values", "margins", "rater_accuracy", "segment_scores"]
+
+
+# A CPU core multiplies fastest what stays in its cache from one layer to the next.
+_ROWS = 1024  # observations looked at together
+
+
+_BLOCK = 2**18  # outputs of a layer, over these observations and some members
+
+
+def _chunks(total: int, size: int) -> Iterator[slice]:
+    for start in range(0, total, size):
+        yield slice(start, min(start + size, total))
+
+
+@torch.no_grad()
+def segment_scores(
+    population: Population,
+    bank: SegmentBank,
+    *,
+    alpha: float = 1.0,
+    discount: float = 1.0,
+    memory_mb: float = 256.0,
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
+    """Score every segment once per member: ``S_n(sigma) = sum_t gamma^t alpha log pi_n(a_t|s_t)``.
+
+    The score inside the CPL loss (arXiv 2310.13639, equation 5); for reward functions the sum of
+    rewards, ``sum_t gamma^t alpha r_n(s_t, a_t)``.
+
+    Observations that occur more than once in the bank are looked at once where actions are
+    discrete, and by reward functions. What a frozen trunk makes of the bank is kept for the next
+    call as long as it takes at most half of ``memory_mb``, else worked out again in chunks. Heads
+    of reward functions are linear: they score a segment by the sum of its features.
+
+    Args:
+        population: N members.
+        bank: The segments.
+        alpha: Temperature of CPL's maximum-entropy policies.
+        discount: Per-step discount gamma.
+        memory_mb: Bound on the temporaries and on what is kept, in MiB, beside the result itself;
+            work is cut into chunks that fit, down to one segment and one member.
+        dtype: Precision in which the members' own layers are multiplied. ``torch.bfloat16`` pays
+            on processors that multiply it in hardware (AMX, AVX-512 BF16, CUDA) and is many times
+            slower on others; margins are off by some thousandths of their spread, so that
+            nearly tied pairs may change sides. Sums over steps are float32 always.
+
+    Returns:
+        ``[N, num_segments]`` float32.
+    """
+    scoring = _Scoring(population, bank, discount, int(memory_mb * 2**18), dtype)
+    scores = torch.empty(len(population), len(bank), device=population.device)
+    if scoring.can_look_up():
+        scoring.look_up(scores)
+    elif len(scoring.layers) == 1 and isinstance(population.spec, RewardSpec):
+        scoring.add_up(scores)
+    else:
+        scoring.walk(scores)
+    return scores.mul_(alpha)
+
+
+class _Scoring:
+    """The three ways to score; ``numbers`` of four bytes may be used, half of them kept."""
+
+    def __init__(
+        self,
+        population: Population,
+        bank: SegmentBank,
+        discount: float,
+        numbers: int,
+        dtype: torch.dtype,
+    ) -> None:
+        self.population, self.bank, self.dtype = population, bank, dtype
+        self.spec, self.trunk = population.spec, population.trunk
+        self.layers = change_layers(population.layers(), lambda tensor: tensor.to(dtype))
+        self.numbers = numbers
+        self.steps = bank.row.shape[1]
+        self.discount = discount
+        self.weight = discount ** torch.arange(self.steps, device=population.device).float()
+        # Two or three results of a layer are alive at once, and as many of the trunk's.
+        block = numbers // 32
+        if population.device.type == "cpu":
+            block = min(block, _BLOCK)
+        spec = self.spec
+        width = max(spec.observation_dim, *spec.hidden, spec.action_dim)
+        self.rows = max(1, min(_ROWS, block // width))
+        own = spec.action_dim if len(self.layers) == 1 else width
+        self.members = max(1, block // (self.rows * own))
+
+    def can_look_up(self) -> bool:
+        """Whether scores of a member's every choice at every distinct observation fit."""
+        cells = len(self.bank.observation) * self.spec.action_dim
+        return self.spec.discrete and self.bank.is_shared and 8 * cells <= self.numbers
+
+    def look_up(self, scores: Tensor) -> None:
+        """Few distinct observations: a table of step scores answers for every step."""
+        bank, spec, steps = self.bank, self.spec, self.steps
+        distinct, choices = len(bank.observation), spec.action_dim
+        features = self._features()
+        for some in _chunks(len(scores), max(1, self.numbers // (8 * distinct * choices))):
+            layers = some_layers(self.layers, some)
+            count = len(scores[some])
+            table = torch.empty(count, distinct, choices, device=scores.device)
+            for rows in _chunks(distinct, self.rows):
+                seen = self._see(rows, features)
+                for members in _chunks(count, self.members):
+                    output = apply_layers(some_layers(layers, members), seen)
+                    table[members, rows] = spec.table(output.float())
+            # Rows of all members' scores, added up over the steps of each segment.
+            cells = table.flatten(1).T.contiguous()
+            for part in _chunks(len(bank), max(1, self.numbers // (8 * (4 * steps + count)))):
+                cell = bank.row[part] * choices + bank.action[part]
+                weight = self.weight.expand(cell.shape).contiguous()
+                scores[some, part] = F.embedding_bag(
+                    cell, cells, mode="sum", per_sample_weights=weight
+                ).T
+
+    def add_up(self, scores: Tensor) -> None:
+        """Heads linear in the features: add these up over the steps, then multiply once."""
+        layer = self.layers[0]
+        assert isinstance(layer, tuple)
+        heads = layer[0].flatten(1)
+        width = heads.shape[1]
+        sums = None
+        if len(self.bank) * width <= self.numbers // 2:
+            sums = self._keep(("sums", self.discount), lambda: self._all_sums(width))
+        size = max(1, self.rows // (1 if sums is not None else self.steps))
+        for part in _chunks(len(self.bank), size):
+            some = self._sums(part) if sums is None else sums[part]
+            scores[:, part] = heads @ some.to(self.dtype).T
+
+    def _all_sums(self, width: int) -> Tensor:
+        sums = torch.empty(len(self.bank), width, device=self.weight.device)
+        for part in _chunks(len(sums), max(1, self.rows // self.steps)):
+            sums[part] = self._sums(part)
+        return sums
+
+    def _sums(self, part: slice) -> Tensor:
+        """Discounted sums of features, apart for each choice, ``[P, K * F]``."""
+        row, action = self.bank.row[part], self.bank.action[part]
+        features: Tensor = self.trunk(self.bank.observation[row])
+        chosen = F.one_hot(action, self.spec.action_dim) * self.weight.unsqueeze(1)
+        return (chosen.mT @ features).flatten(1)
+
+    def walk(self, scores: Tensor) -> None:
+        """Look at every step of every segment."""
+        bank, spec = self.bank, self.spec
+        features = self._features()
+        for part in _chunks(len(bank), max(1, self.rows // self.steps)):
+            seen = self._see(bank.row[part].flatten(), features)
+            action = bank.action[part].flatten(0, 1)
+            for members in _chunks(len(scores), self.members):
+                output = apply_layers(some_layers(self.layers, members), seen)
+                value = spec.step_scores(output.float(), action).unflatten(1, (-1, self.steps))
+                scores[members, part] = value @ self.weight
+
+    def _features(self) -> Tensor | None:
+        """The trunk's outputs at all distinct observations, if they may be kept."""
+        if not len(self.trunk):
+            return self.bank.observation
+        width = self.spec.hidden[-1]
+        if len(self.bank.observation) * width > self.numbers // 2:
+            return None
+        return self._keep(("features",), lambda: self._all_features(width))
+
+    def _all_features(self, width: int) -> Tensor:
+        observation = self.bank.observation
+        features = torch.empty(len(observation), width, device=observation.device)
+        for part in _chunks(len(features), self.rows):
+            features[part] = self.trunk(observation[part])
+        return features
+
+    def _keep(self, purpose: tuple[object, ...], make: Callable[[], Tensor]) -> Tensor:
+        return self.population.trunk_cache.get(self.trunk, self.bank, purpose, make)
+
+    def _see(self, rows: slice | Tensor, features: Tensor | None) -> Tensor:
+        """Features at these rows of the distinct observations."""
+        seen = self.trunk(self.bank.observation[rows]) if features is None else features[rows]
+        return seen.to(self.dtype)
+
+
+def margins(
+    population: Population,
+    bank: SegmentBank,
+    comparisons: Comparisons,
+    *,
+    alpha: float = 1.0,
+    discount: float = 1.0,
+) -> Tensor:
+    """Margins ``Delta = S(sigma+) - S(sigma-)`` of every member on every comparison, ``[N, M]``."""
+    scores = segment_scores(population, bank, alpha=alpha, discount=discount)
+    return scores[:, comparisons.preferred] - scores[:, comparisons.other]
+
+
+def case_values(passes: Tensor, comparisons: Comparisons) -> Tensor:
+    """Share of each case's comparisons that each member passes.
+
+    Args:
+        passes: ``[N, M]`` bool.
+        comparisons: The M comparisons and the case of each.
+
+    Returns:
+        ``[N, C]`` float32; 0 or 1 where a case is a single preference.
+    """
+    total = torch.zeros(len(passes), comparisons.num_cases, device=passes.device)
+    total.index_add_(1, comparisons.case, passes.float())
+    return total / comparisons.case.bincount(minlength=comparisons.num_cases).clamp(min=1)
+
+
+def rater_accuracy(values: Tensor, quantile: float = 0.1) -> float:
+    """A low quantile over cases of the best member's value: is anybody left out?
+
+    Needs no group labels: it is small as long as some raters find no member that serves them.
+    """
+    return float(values.amax(0).quantile(quantile))

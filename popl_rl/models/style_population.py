@@ -1,0 +1,78 @@
+"""A population whose members are style codes of one frozen network."""
+
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from torch import Tensor, nn
+
+from popl_rl.models.layers import Layer, activation
+from popl_rl.models.population import Population
+from popl_rl.models.style_codes import StyleClone
+
+__all__ = ["StyledPopulation"]
+
+
+class StyledPopulation(Population):
+    """Members of a few numbers each, fed to a frozen :class:`~popl_rl.models.style_codes.StyleClone`.
+
+    For a fixed code the clone is an ordinary policy network: what the code adds to the first layer
+    is a bias. All other weights are shared, so scoring multiplies large matrices and a member is
+    stored, varied and swapped at the cost of its code.
+
+    Args:
+        clone: What the codes are told to.
+        codes: The members, ``[N, D]``.
+
+    Attributes:
+        members: A ``TensorDictParams`` of batch size ``[N]`` with ``code``.
+
+    Raises:
+        ValueError: If there are no codes, or they are not of the clone's length.
+    """
+
+    def __init__(self, clone: StyleClone, codes: Tensor) -> None:
+        nn.Module.__init__(self)
+        expected = clone.codes.shape[1]
+        if codes.ndim != 2 or not len(codes) or codes.shape[1] != expected:
+            raise ValueError(
+                f"codes must have shape [members, {expected}] with at least one member, got "
+                f"{list(codes.shape)}"
+            )
+        self.spec = clone.spec
+        self.evolve = "code"
+        self.trunk = nn.Sequential()
+        self.clone = clone
+        self.members = TensorDictParams(TensorDict({"code": codes.clone()}, [len(codes)]))
+
+    def layers(self) -> list[Layer]:
+        seen, told, bias = self.clone.first_layer()
+        layers: list[Layer] = [(seen, bias + self.members["code"] @ told.T)]
+        for layer in list(self.clone.network)[1:]:
+            if isinstance(layer, nn.Linear):
+                layers.append((layer.weight, layer.bias))
+            else:
+                layers.append(activation(layer) or layer)
+        return layers
+
+    @torch.no_grad()
+    def constrain_(self) -> None:
+        """Put codes back into the box that most of the data's codes lie in."""
+        code = self.members.data["code"]
+        code.copy_(code.clamp(self.clone.low, self.clone.high))
+
+    def with_members(self, members: TensorDictBase) -> "StyledPopulation":
+        """See :class:`~popl_rl.models.population.Population`."""
+        return StyledPopulation(self.clone, members["code"])
+
+    def network(self, index: int) -> nn.Sequential:
+        """Member ``index`` as an ordinary network with parameters of its own."""
+        network = self._blank_network()
+        seen, told, bias = self.clone.first_layer()
+        own = {name: value.clone() for name, value in self.clone.network.state_dict().items()}
+        own["0.weight"] = seen.clone()
+        own["0.bias"] = bias + told @ self.members.data["code"][index]
+        network.load_state_dict(own)
+        return network
+
+    def plain(self) -> Population:
+        """The same policies as whole networks."""
+        return Population([self.network(index) for index in range(len(self))], self.spec)

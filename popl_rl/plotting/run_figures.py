@@ -1,0 +1,153 @@
+"""The pictures of a run, drawn from its files and its scoreboard."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+
+from popl_rl.algorithms.reward_baselines import RewardBaselines
+from popl_rl.data.environments import World
+from popl_rl.data.rollouts import MASK
+from popl_rl.evaluation.evaluator import Evaluator
+from popl_rl.evaluation.results import Scoreboard
+from popl_rl.keys import INFO
+from popl_rl.models.hypothesis_set import HypothesisSet
+from popl_rl.plotting import run_plots as plots
+from popl_rl.plotting.motion_figures import animate, draw_motion
+from popl_rl.plotting.reward_figures import draw_rewards
+from popl_rl.plotting.style import save
+
+__all__ = ["draw", "occupancy_map"]
+
+#: What a recovery of 0 is, by ``evaluation.reference``.
+_FLOORS = {
+    "random": "random actions",
+    "clone": "a clone of the data",
+    "others": "what suits\nanother group",
+}
+
+
+def occupancy_map(episodes: TensorDictBase, cells: torch.Tensor) -> NDArray[np.float64]:
+    """Share of steps spent in each cell of a grid.
+
+    Args:
+        episodes: With ``("info", "state")``, ``[..., H]``.
+        cells: Column and row of every state, ``[S, 2]``.
+
+    Returns:
+        ``[rows, columns]``, summing to 1.
+    """
+    state = episodes[INFO, "state"][episodes[MASK]].long()
+    column, row = cells[state].unbind(-1)
+    counts = torch.zeros(int(cells[:, 1].max()) + 2, int(cells[:, 0].max()) + 2)
+    counts.index_put_((row, column), torch.ones(len(state)), accumulate=True)
+    share: NDArray[np.float64] = (counts / counts.sum()).double().numpy()
+    return share
+
+
+def draw(
+    run_dir: Path,
+    found: HypothesisSet,
+    baselines: HypothesisSet | None,
+    *,
+    board: Scoreboard,
+    evaluator: Evaluator,
+    world: World,
+    reward_baselines: RewardBaselines | None = None,
+) -> dict[str, Path]:
+    """Draw every picture that the run has the data for, into ``run_dir/figures``.
+
+    The occupancy map needs an environment with ``cells`` (column and row of every state) and
+    ``("info", "state")``.
+
+    Returns:
+        Name and file of each picture.
+    """
+    folder = run_dir / "figures"
+    folder.mkdir(exist_ok=True)
+    names = [group.name for group in evaluator.groups]
+    metrics = pd.read_csv(run_dir / "metrics.csv")
+    figures = {
+        "learning": plots.learning_curves(metrics),
+    }
+    if "selection_depth" in metrics:
+        figures["selection"] = plots.selection(metrics)
+    table = board.results
+    measured = (table.measure == "recovery") & ~table.method.isin(["oracle", "random"])
+    if table.value[measured].notna().any():
+        # Recovery is open without an oracle, or with one no better than random.
+        figures["recovery"] = plots.recovery_bars(
+            board.results, floor=_FLOORS[evaluator.config.reference]
+        )
+    history = run_dir / "history.csv"
+    if history.exists() and len(names) > 1:
+        snapshots = pd.read_csv(history)
+        columns = [
+            [c for c in map(str, snapshots) if c.rsplit("/", 1)[0] == name] for name in names
+        ]
+        accuracy = np.stack([snapshots[column].to_numpy() for column in columns], -1)
+        pooled, oracle = None, None
+        if baselines is not None:
+            rows = evaluator.accuracy(baselines).numpy()
+            pooled = rows[0]
+            oracle = {name: rows[1 + index] for index, name in enumerate(names)}
+        figures["members"] = plots.members(
+            accuracy,
+            snapshots.generation.tolist(),
+            names,
+            catered={
+                name: found.origin[index] for name, index in board.catered.items() if found.origin
+            },
+            pooled=pooled,
+            oracle=oracle,
+        )
+    cells = getattr(world.env.unwrapped, "cells", None)
+    if cells is not None:
+        maps = {
+            f"set, catered to {name}": occupancy_map(board.episodes[board.label, name], cells)
+            for name in names
+        }
+        if baselines is not None:
+            pooled_name = "cpl" if ("cpl", names[0]) in board.episodes else "bradley_terry"
+            title = plots.method_name(pooled_name)
+            maps[title] = occupancy_map(board.episodes[pooled_name, names[0]], cells)
+        figures["occupancy"] = plots.occupancy(
+            picture(world),
+            maps,
+            suptitle="Where the policies go",
+            caption="Each rater group gets its own policy from the set; pooled CPL is one policy "
+            "for everybody.",
+        )
+    figures |= draw_motion(found, board=board, evaluator=evaluator)
+    figures |= draw_rewards(
+        found, baselines, board=board, evaluator=evaluator, reward_baselines=reward_baselines
+    )
+    paths = {}
+    for name, figure in figures.items():
+        paths[name] = folder / f"{name}.png"
+        save(figure, paths[name])
+    if evaluator.config.animate:
+        try:
+            paths |= animate(folder, found, board=board, world=world, seed=evaluator.seed)
+        except RuntimeError as error:
+            # Pictures that need a renderer are no reason to lose a run that is done.
+            warnings.warn(f"no animations were made: {error}", stacklevel=2)
+    return paths
+
+
+def picture(world: World) -> NDArray[np.uint8] | None:
+    """A picture of the environment at a start, or None if it draws none."""
+    inner = world.env.unwrapped
+    if "rgb_array" not in inner.metadata.get("render_modes", []):
+        return None
+    before, inner.render_mode = inner.render_mode, "rgb_array"
+    try:
+        inner.reset(seed=0)
+        image = inner.render()
+    finally:
+        inner.render_mode = before
+    return None if image is None else np.asarray(image, dtype=np.uint8)

@@ -1,0 +1,141 @@
+"""Preferences: which pairs are shown, to whom, and what they answer."""
+
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import Transform
+
+from popl_rl.data.segments import stored_segments
+from popl_rl.keys import ANSWER, GROUP, PAIR, RATER, UTILITY, Answer
+from popl_rl.raters.pairs import draw_pairs, starts_of
+from popl_rl.raters.people import Raters
+from popl_rl.storage import load_tensordict
+
+__all__ = ["PreferenceCollector", "collect_preferences", "load_preferences"]
+
+
+class PreferenceCollector(Transform):
+    """Has raters compare pairs of stored segments, as queries are written to a replay buffer.
+
+    Append it to the buffer that keeps preferences and extend that buffer with queries: a
+    TensorDict ``[M]`` with ``rater`` (whom to ask) and, if you choose the queries yourself,
+    ``pair``. Pairs that are not given are drawn uniformly from the stored segments: where these say
+    which state they go on from (:data:`~popl_rl.keys.START`), from those of one state. What is
+    written is the query with ``answer`` and, for evaluation only, ``("hidden", "group")`` and
+    ``("hidden", "utility")``.
+
+    Args:
+        segments: Replay buffer of segments, one item each.
+        raters: Who can be asked.
+        generator: Source of the pairs and of the raters' randomness.
+
+    Raises:
+        ValueError: If there are fewer than two segments; when the buffer is extended, if a query
+            names a rater or a segment that does not exist.
+
+    Example:
+        >>> preferences = TensorDictReplayBuffer(
+        ...     storage=LazyTensorStorage(100), transform=PreferenceCollector(
+        ...         segments, raters, generator=generator))  # doctest: +SKIP
+        >>> queries = TensorDict({"rater": torch.zeros(100).long()}, [100])
+        >>> preferences.extend(queries)  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        segments: TensorDictReplayBuffer,
+        raters: Raters,
+        *,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__(in_keys=[], out_keys=[])
+        if len(segments) < 2:
+            raise ValueError(f"segments must hold at least two to compare, got {len(segments)}")
+        self.segments = segments
+        self.raters = raters
+        self.generator = generator
+        #: Worth of each segment to each group, ``[G, N]``.
+        steps = stored_segments(segments)
+        self.segment_utility: Tensor = raters.segment_utility(steps)
+        self.start = starts_of(steps)
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        rater = tensordict[RATER]
+        if not ((rater >= 0) & (rater < len(self.raters))).all():
+            raise ValueError(
+                f"rater must be ids in 0..{len(self.raters) - 1}, got {rater.min()}..{rater.max()}"
+            )
+        pair = tensordict.get(PAIR, None)
+        if pair is None:
+            pair = draw_pairs(
+                len(self.segments), len(rater), start=self.start, generator=self.generator
+            )
+        elif not ((pair >= 0) & (pair < len(self.segments))).all():
+            raise ValueError(
+                f"pair must be segments in 0..{len(self.segments) - 1}, got {pair.min()}.."
+                f"{pair.max()}"
+            )
+        group = self.raters.group_of[rater]
+        answer = self.raters.answer(pair, rater, self.segment_utility, generator=self.generator)
+        out = TensorDict({PAIR: pair, ANSWER: answer, RATER: rater}, [len(rater)])
+        out[GROUP] = group
+        out[UTILITY] = self.segment_utility[group.unsqueeze(-1), pair]
+        return out
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Preferences are read as they were written."""
+        return tensordict
+
+
+def collect_preferences(
+    segments: TensorDictReplayBuffer,
+    raters: Raters,
+    *,
+    answers_per_rater: int,
+    generator: torch.Generator,
+) -> TensorDictReplayBuffer:
+    """Ask every rater about the same number of random pairs.
+
+    Returns:
+        Replay buffer of ``len(raters) * answers_per_rater`` preferences.
+
+    Raises:
+        ValueError: If ``answers_per_rater`` is not positive.
+    """
+    if answers_per_rater < 1:
+        raise ValueError(f"answers_per_rater must be at least 1, got {answers_per_rater}")
+    rater = torch.arange(len(raters)).repeat_interleave(answers_per_rater)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(len(rater)),
+        transform=PreferenceCollector(segments, raters, generator=generator),
+        batch_size=min(256, len(rater)),
+    )
+    buffer.extend(TensorDict({RATER: rater}, [len(rater)]))
+    return buffer
+
+
+def load_preferences(path: Path, *, num_segments: int) -> TensorDict:
+    """Read saved preferences and check that they belong to the segments at hand.
+
+    Raises:
+        FileNotFoundError: If there is no such folder.
+        ValueError: If it is damaged, foreign, or refers to segments that do not exist.
+    """
+    data = load_tensordict(path, required={PAIR: 2, ANSWER: 1, RATER: 1})
+    pair, answer = data[PAIR], data[ANSWER]
+    if pair.dtype != torch.int64 or pair.shape != (len(answer), 2) or not len(pair):
+        raise ValueError(
+            f"{path} must hold pairs of segment numbers, int64 of shape [M, 2], got {pair.dtype} "
+            f"of shape {list(pair.shape)} for {len(answer)} answers; it is damaged or foreign"
+        )
+    if pair.min() < 0 or pair.max() >= num_segments:
+        raise ValueError(
+            f"{path} compares segments {int(pair.min())}..{int(pair.max())}, but there are "
+            f"0..{num_segments - 1}; these preferences belong to other segments"
+        )
+    if answer.min() < 0 or answer.max() > max(Answer):
+        raise ValueError(f"{path} holds answers outside 0..{max(Answer)}; it is damaged or foreign")
+    return data

@@ -1,0 +1,160 @@
+"""The mixture of CPL policies that EM fits."""
+
+import math
+
+import pytest
+import torch
+
+from popl_rl.algorithms.em import EM, case_likelihood, responsibility
+from popl_rl.config import MethodConfig
+from popl_rl.experiments.builders import build_popl, final_set
+from popl_rl.models.policies import PolicySpec
+from popl_rl.models.scoring import case_values, margins
+
+SPEC = PolicySpec(5, 2, True, (6,))
+
+
+def build(bank, comparisons, *, seed=0, **settings):
+    settings = {"members": 4, "groups": 2, "generations": 4, "steps": 3, **settings}
+    config = MethodConfig(algorithm="em", hidden=[6], batch_size=16, **settings)
+    generator = torch.Generator().manual_seed(seed)
+    return build_popl(config, SPEC, bank, comparisons, generator=generator)
+
+
+def tensors(popl):
+    return [
+        popl.share,
+        *(value.clone() for value in popl.population.members.data.values(True, True)),
+    ]
+
+
+def two_raters(comparisons):
+    """Three answers: two of the first rater, one of the second."""
+    case = torch.tensor([0, 0, 1])
+    return type(comparisons)(comparisons.preferred[:3], comparisons.other[:3], case, 2)
+
+
+#: Margins under which two policies give the three answers with these chances.
+CHANCES = torch.tensor([[0.8, 0.5, 0.3], [0.4, 0.5, 0.9]])
+
+
+def test_a_raters_likelihood_is_the_product_over_its_answers(comparisons):
+    """0.8 * 0.5 = 0.4 and 0.4 * 0.5 = 0.2; the second rater's one answer has 0.3 and 0.9."""
+    likelihood = case_likelihood(CHANCES.logit(), two_raters(comparisons))
+    torch.testing.assert_close(likelihood.exp(), torch.tensor([[0.4, 0.3], [0.2, 0.9]]))
+
+
+def test_responsibilities_by_hand():
+    """With shares 3/4 and 1/4: 0.3 against 0.05 is 6/7, and 0.225 against 0.225 is a half."""
+    likelihood = torch.tensor([[[0.4, 0.3], [0.2, 0.9]]])
+    joint = likelihood.log() + torch.tensor([[0.75, 0.25]]).log().unsqueeze(-1)
+    expected = torch.tensor([[[6 / 7, 0.5], [1 / 7, 0.5]]])
+    torch.testing.assert_close(responsibility(joint), expected)
+
+
+def test_a_generation_by_hand(monkeypatch, bank, comparisons):
+    """Both mixtures have shares of a half.
+
+    The first is as above: responsibilities 0.4 / 0.6 and 0.3 / 1.2, shares 11/24 and 13/24, and
+    log-likelihoods log 0.3 and log 0.6. The second, of equals, divides everything by half and is
+    less likely, 0.01 and 0.1.
+    """
+    said = two_raters(comparisons)
+    popl = build(bank, said)
+    equal = torch.full((2, 3), 0.1)
+    margin = torch.cat([CHANCES, equal]).logit()
+    monkeypatch.setattr("popl_rl.algorithms.multi_cpl.margins", lambda *_, **__: margin)
+    given = []
+
+    def trained(parents, weight):
+        given.append((parents, weight))
+        return {}
+
+    monkeypatch.setattr(popl, "training", trained)
+    metrics = popl.step()
+    ((parents, weight),) = given
+    assert parents.tolist() == [0, 1, 2, 3], "all stay themselves"
+    expected = [[2 / 3, 2 / 3, 1 / 4], [1 / 3, 1 / 3, 3 / 4], [0.5] * 3, [0.5] * 3]
+    torch.testing.assert_close(weight, torch.tensor(expected))
+    torch.testing.assert_close(popl.share, torch.tensor([[11 / 24, 13 / 24], [0.5, 0.5]]))
+    assert metrics["log_likelihood"] == pytest.approx((math.log(0.3) + math.log(0.6)) / 2)
+    assert metrics["smallest_share"] == pytest.approx(11 / 24)
+
+
+def test_a_component_without_a_share_may_come_back(monkeypatch, bank, comparisons):
+    """What a thousandth of a share explains far better than the rest is given back to it."""
+    popl = build(bank, two_raters(comparisons), members=2)
+    popl.share = torch.tensor([[1.0, 0.0]])
+    margin = torch.tensor([[-20.0] * 3, [5.0] * 3])
+    monkeypatch.setattr("popl_rl.algorithms.multi_cpl.margins", lambda *_, **__: margin)
+    popl.step()
+    assert popl.share[0, 1] > 0.99
+
+
+@pytest.mark.parametrize(
+    ("members", "told", "shape"), [(32, 2, (16, 2)), (32, 3, (10, 3)), (2, 5, (1, 5))]
+)
+def test_as_many_starts_as_there_is_room_for(bank, comparisons, members, told, shape):
+    popl = build(bank, comparisons, members=members, groups=told)
+    assert isinstance(popl, EM)
+    assert tuple(popl.share.shape) == shape
+    assert len(popl.population) == shape[0] * shape[1]
+    assert len(final_set(popl)) == told
+
+
+def test_mixtures_must_be_whole(bank, comparisons):
+    popl = build(bank, comparisons)
+    parts = (popl.population, bank, comparisons)
+    message = r"population must hold mixtures of groups=3 policies each, got 4 policies"
+    with pytest.raises(ValueError, match=message):
+        EM(*parts, groups=3, training=popl.training, generator=popl.generator)
+
+
+def test_the_likeliest_start_is_the_result(monkeypatch, bank, comparisons):
+    popl = build(bank, comparisons)
+    monkeypatch.setattr(popl, "likelihood", lambda: torch.tensor([-2.0, -1.0]))
+    found = final_set(popl)
+    assert found.origin == [2, 3]
+    members = popl.population.members.data
+    kept = found.population.members.data
+    assert all(torch.equal(kept[key], members[key][2:]) for key in kept.keys(True, True))
+
+
+def test_two_obvious_groups_are_found(bank, comparisons):
+    """Four raters want to be left and four right; each component ends with one group."""
+    popl = build(bank, comparisons, members=8, generations=12, steps=15, learning_rate=0.02)
+    metrics = [popl.step() for _ in range(12)]
+    found = final_set(popl)
+    values = case_values(
+        margins(found.population, bank, comparisons, alpha=found.alpha) > 0, comparisons
+    )
+    left, right = values[:, :4].mean(1), values[:, 4:].mean(1)
+    assert left.argmax() != right.argmax()
+    assert float(left.max()) > 0.85
+    assert float(right.max()) > 0.85
+    assert metrics[-1]["log_likelihood"] > metrics[0]["log_likelihood"]
+    assert metrics[-1]["smallest_share"] == pytest.approx(0.5, abs=0.05)
+
+
+def test_the_seed_decides_everything(bank, comparisons):
+    def run(seed):
+        popl = build(bank, comparisons, seed=seed)
+        return [popl.step() for _ in range(3)], tensors(popl)
+
+    metrics, found = run(0)
+    again, same = run(0)
+    assert again == metrics
+    assert all(map(torch.equal, found, same))
+    assert not any(map(torch.equal, found, run(1)[1]))
+
+
+def test_continuing_is_as_never_having_stopped(bank, comparisons):
+    straight = build(bank, comparisons)
+    straight.step()
+    state = straight.state_dict()
+    expected = [straight.step() for _ in range(3)]
+    resumed = build(bank, comparisons, seed=5)
+    resumed.load_state_dict(state)
+    assert [resumed.step() for _ in range(3)] == expected
+    assert all(map(torch.equal, tensors(straight), tensors(resumed)))
+    assert final_set(straight).origin == final_set(resumed).origin
