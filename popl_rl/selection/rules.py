@@ -23,7 +23,7 @@ __all__ = [
     "nsga2_selection",
     "random_selection",
     "report",
-    "selection_of",
+    "selection_rule",
     "tournament_selection",
 ]
 
@@ -178,7 +178,7 @@ SELECTIONS: dict[str, Callable[..., Tensor]] = {
 """Rules by name."""
 
 
-def selection_of(name: str, *, tournament: int = 4) -> Selection | None:
+def selection_rule(name: str, *, tournament: int = 4) -> Selection | None:
     """Rule of a name; None stands for lexicase selection.
 
     Args:
