@@ -211,7 +211,8 @@ class VPL:
         generations: Generations after which it is finished.
 
     Raises:
-        ValueError: If hypotheses are no policies, or style codes, or every case is one preference.
+        ValueError: If hypotheses are no policies, or style codes, every case is one preference,
+            ``latent`` is below 1 or ``kl`` negative.
     """
 
     def __init__(self, problem: Problem, *, vpl: VPLSettings, generator: torch.Generator) -> None:
@@ -229,6 +230,10 @@ class VPL:
                 "method vpl needs rater ids, because its encoder reads what one rater said; use "
                 "method.cases=rater with several answers of each"
             )
+        if vpl.latent < 1:
+            raise ValueError(f"vpl.latent must be at least 1, got {vpl.latent}")
+        if not vpl.kl >= 0:
+            raise ValueError(f"vpl.kl must be at least 0, got {vpl.kl}")
         self.problem, self.spec = problem, problem.spec
         self.kl, self.answers = vpl.kl, vpl.answers
         self.raters = max(1, problem.training.batch_size // vpl.answers)

@@ -195,7 +195,7 @@ class MethodConfig:
         unknown = [name for name in self.reads if name not in SECTIONS]
         at.expect(not unknown, "reads", f"sections out of {', '.join(SECTIONS)}", unknown)
         at.one_of(self, "learns", ("auto", "policy", "reward"))
-        at.one_of(self, "cases", ("rater", "preference"))
+        at.expect(self.cases in ("rater", "preference"), "cases", "rater or preference", self.cases)
         at.one_of(self, "evolve", ("all", "head", "code"))
         at.at_least_one(self, "members", "generations")
         at.expect(all(units >= 1 for units in self.hidden), "hidden", "positive", self.hidden)
