@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.stats import chisquare
 
-from popl_rl.config import _SELECTIONS, MethodConfig
+from popl_rl.config import Config, MethodConfig, RatersConfig, validate
 from popl_rl.experiments.builders import build_popl
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.scoring import case_values, margins
@@ -12,6 +12,7 @@ from popl_rl.selection import rules as selection
 from popl_rl.selection.rules import (
     SELECTIONS,
     best_sum_selection,
+    fronts_and_crowding,
     nsga2_selection,
     random_selection,
     report,
@@ -75,7 +76,7 @@ def test_fronts_and_crowding_on_paper():
     In the first front 0 and 2 are at the ends. On each case the neighbours of member 1 are these
     two, as far apart as the front is wide; pymoo takes the mean over the cases, (1 + 1) / 2.
     """
-    front, crowding = selection._fronts(VALUES)
+    front, crowding = fronts_and_crowding(VALUES)
     assert front.tolist() == [0, 0, 0, 1]
     assert crowding[:3].tolist() == [torch.inf, 1.0, torch.inf]
 
@@ -132,7 +133,11 @@ def test_sizes_are_checked(generator):
 
 
 def test_rules_have_the_names_of_the_configuration():
-    assert ("lexicase", *SELECTIONS) == _SELECTIONS
+    known = ", ".join(["lexicase", *SELECTIONS])
+    config = Config(raters=RatersConfig(groups=["upper", "lower"]))
+    config.method.selection = "roulette"
+    with pytest.raises(ValueError, match=f"method.selection must be {known}, got 'roulette'"):
+        validate(config)
     assert selection_of("lexicase") is None
     assert selection_of("best_sum") is best_sum_selection
     with pytest.raises(ValueError, match=r"selection must be one of lexicase, .*got 'roulette'"):
