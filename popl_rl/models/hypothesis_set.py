@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import ClassVar, Literal, Self, cast
+from typing import Any, ClassVar, Literal, Self, cast
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
@@ -205,7 +205,7 @@ class HypothesisSet:
             about = json.loads(about_path.read_text())
             if about["format"] != f"popl_rl.{cls._kind}_set/1":
                 raise ValueError(f"unknown format {about['format']!r}")
-            sizes = {  # JSON knows no tuples
+            sizes: dict[str, Any] = {  # JSON knows no tuples
                 name: tuple(value) if isinstance(value, list) else value
                 for name, value in about["spec"].items()
             }
