@@ -139,23 +139,15 @@ def train_ppo(
         raise ValueError(f"entropy must be 0 or positive, got {entropy}")
 
     network = build_network(spec, generator=generator)
-    actor = build_actor(spec, network)
-    value = PolicySpec(spec.observation_dim, 1, discrete=False, hidden=spec.hidden)
-    critic = ValueOperator(build_network(value, generator=generator), in_keys=[OBSERVATION])
-    advantage = GAE(gamma=discount, lmbda=gae_lambda, value_network=critic, deactivate_vmap=True)
-    loss = ClipPPOLoss(
-        actor,
-        critic,
+    learner = _Learner(
+        spec,
+        network,
+        discount=discount,
+        gae_lambda=gae_lambda,
         clip_epsilon=clip_epsilon,
-        entropy_coeff=entropy,
-        critic_coeff=0.5,
-        loss_critic_type="l2",
-        log_explained_variance=False,
-        functional=False,
+        learning_rate=learning_rate,
+        generator=generator,
     )
-    loss.set_keys(sample_log_prob=_LOG_PROB)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=learning_rate, eps=1e-5, fused=True)
-    returns = RunningValueNorm(shape=1, epsilon=1e-16)
     envs = [_Ending(make_env()) for _ in range(num_envs)]
     try:
         _check_spec(spec, envs[0])
@@ -169,19 +161,9 @@ def train_ppo(
             action = _clip(envs[0].action_space, batch[ACTION])
             gain = _rewards(reward, batch[OBSERVATION], action)
             over = batch["next", "done"].squeeze(-1)
-            returns.update(_running_returns(gain, over, discount))
-            batch["next", REWARD] = gain.unsqueeze(-1) / returns.scale()
-            with torch.no_grad():
-                advantage(batch)
-                batch[_LOG_PROB] = actor.get_dist(batch).log_prob(batch[ACTION])
-            # Here and not by the loss, whose last minibatch may be a single step.
-            centred = batch[_ADVANTAGE] - batch[_ADVANTAGE].mean()
-            batch[_ADVANTAGE] = centred / centred.square().mean().sqrt().clamp(min=1e-8)
-            left = 1 - done / frames
-            loss.entropy_coeff.fill_(entropy * left)
-            for group in optimizer.param_groups:
-                group["lr"] = learning_rate * left
-            _update(loss, optimizer, batch, epochs, minibatch, generator)
+            learner.value(batch, gain)
+            learner.anneal(1 - done / frames, entropy)
+            learner.update(batch, epochs, minibatch)
             done += len(batch)
             if progress is not None:
                 progress(done, float(gain.sum() / over.sum()))
@@ -189,6 +171,85 @@ def train_ppo(
         for env in envs:
             env.close()
     return Population([network], spec)
+
+
+class _Learner:
+    """Actor, critic and optimiser, which learn from one batch of steps after the other."""
+
+    def __init__(
+        self,
+        spec: PolicySpec,
+        network: nn.Sequential,
+        *,
+        discount: float,
+        gae_lambda: float,
+        clip_epsilon: float,
+        learning_rate: float,
+        generator: torch.Generator,
+    ) -> None:
+        self.discount, self.learning_rate = discount, learning_rate
+        self.generator = generator
+        self.actor = build_actor(spec, network)
+        value = PolicySpec(spec.observation_dim, 1, discrete=False, hidden=spec.hidden)
+        critic = ValueOperator(build_network(value, generator=generator), in_keys=[OBSERVATION])
+        self.advantage = GAE(
+            gamma=discount, lmbda=gae_lambda, value_network=critic, deactivate_vmap=True
+        )
+        self.loss = ClipPPOLoss(
+            self.actor,
+            critic,
+            clip_epsilon=clip_epsilon,
+            entropy_coeff=0.0,  # set for each batch
+            critic_coeff=0.5,
+            loss_critic_type="l2",
+            log_explained_variance=False,
+            functional=False,
+        )
+        self.loss.set_keys(sample_log_prob=_LOG_PROB)
+        self.optimizer = torch.optim.Adam(
+            self.loss.parameters(), lr=learning_rate, eps=1e-5, fused=True
+        )
+        self.returns = RunningValueNorm(shape=1, epsilon=1e-16)
+
+    def value(self, batch: TensorDict, gain: Tensor) -> None:
+        """Write scaled rewards, log-probabilities and advantages into a batch ``[S]``, in place.
+
+        Args:
+            batch: Steps of whole episodes, one episode after the other.
+            gain: Reward of each step, ``[S]``.
+        """
+        over = batch["next", "done"].squeeze(-1)
+        self.returns.update(_running_returns(gain, over, self.discount))
+        batch["next", REWARD] = gain.unsqueeze(-1) / self.returns.scale()
+        with torch.no_grad():
+            self.advantage(batch)
+            batch[_LOG_PROB] = self.actor.get_dist(batch).log_prob(batch[ACTION])
+        # Here and not by the loss, whose last minibatch may be a single step.
+        centred = batch[_ADVANTAGE] - batch[_ADVANTAGE].mean()
+        batch[_ADVANTAGE] = centred / centred.square().mean().sqrt().clamp(min=1e-8)
+
+    def anneal(self, left: float, entropy: float) -> None:
+        """Scale step size and entropy bonus by the share of the frames that is left."""
+        self.loss.entropy_coeff.fill_(entropy * left)
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.learning_rate * left
+
+    def update(self, batch: TensorDict, epochs: int, minibatch: int) -> None:
+        """Take gradient steps on minibatches of a batch ``[S]``, in passes over all of it."""
+        buffer = ReplayBuffer(
+            storage=TensorStorage(batch.exclude("next")),
+            sampler=SamplerWithoutReplacement(),
+            batch_size=minibatch,
+            generator=self.generator,
+        )
+        for _ in range(epochs):
+            for some in buffer:
+                terms = self.loss(some)
+                total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
+                self.optimizer.zero_grad()
+                total.backward()
+                nn.utils.clip_grad_norm_(self.loss.parameters(), 0.5)
+                self.optimizer.step()
 
 
 class _Ending(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -310,27 +371,3 @@ def _running_returns(gain: Tensor, done: Tensor, discount: float) -> Tensor:
         sums.append(total)
         total = 0.0 if ends else total
     return torch.tensor(sums).unsqueeze(-1)
-
-
-def _update(
-    loss: ClipPPOLoss,
-    optimizer: torch.optim.Optimizer,
-    batch: TensorDict,
-    epochs: int,
-    minibatch: int,
-    generator: torch.Generator,
-) -> None:
-    buffer = ReplayBuffer(
-        storage=TensorStorage(batch.exclude("next")),
-        sampler=SamplerWithoutReplacement(),
-        batch_size=minibatch,
-        generator=generator,
-    )
-    for _ in range(epochs):
-        for some in buffer:
-            terms = loss(some)
-            total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
-            optimizer.zero_grad()
-            total.backward()
-            nn.utils.clip_grad_norm_(loss.parameters(), 0.5)
-            optimizer.step()
