@@ -5,12 +5,11 @@ a constant per step, so where an episode can end, whether ending it pays is not 
 the offset of a reward learnt from returns before it is maximised there.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
 import gymnasium
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
@@ -19,7 +18,12 @@ from torchrl.modules import RunningValueNorm, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from popl_rl.data.rollouts import MASK, lockstep
+from popl_rl.evaluation.ppo_episodes import (
+    Ending,
+    clip_actions,
+    roll_episodes,
+    running_returns,
+)
 from popl_rl.keys import ACTION, OBSERVATION, REWARD
 from popl_rl.models.policies import PolicySpec, build_actor, build_network
 from popl_rl.models.population import Population
@@ -148,7 +152,7 @@ def train_ppo(
         learning_rate=learning_rate,
         generator=generator,
     )
-    envs = [_Ending(make_env()) for _ in range(num_envs)]
+    envs = [Ending(make_env()) for _ in range(num_envs)]
     try:
         _check_spec(spec, envs[0])
         act = partial(_act, spec, network, generator=generator)
@@ -156,9 +160,9 @@ def train_ppo(
         while done < frames:
             rolled: list[TensorDict] = []
             while sum(map(len, rolled)) < frames_per_batch:
-                rolled.append(_roll(envs, act, max_steps=max_steps, generator=generator))
+                rolled.append(roll_episodes(envs, act, max_steps=max_steps, generator=generator))
             batch: TensorDict = TensorDict.cat(rolled)
-            action = _clip(envs[0].action_space, batch[ACTION])
+            action = clip_actions(envs[0].action_space, batch[ACTION])
             gain = _rewards(reward, batch[OBSERVATION], action)
             over = batch["next", "done"].squeeze(-1)
             learner.value(batch, gain)
@@ -219,7 +223,7 @@ class _Learner:
             gain: Reward of each step, ``[S]``.
         """
         over = batch["next", "done"].squeeze(-1)
-        self.returns.update(_running_returns(gain, over, self.discount))
+        self.returns.update(running_returns(gain, over, self.discount))
         batch["next", REWARD] = gain.unsqueeze(-1) / self.returns.scale()
         with torch.no_grad():
             self.advantage(batch)
@@ -250,36 +254,6 @@ class _Learner:
                 total.backward()
                 nn.utils.clip_grad_norm_(self.loss.parameters(), 0.5)
                 self.optimizer.step()
-
-
-class _Ending(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Keeps how an episode ended, which lockstep does not record, and keeps actions in bounds."""
-
-    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
-        super().__init__(env)
-        self.last: Any = None
-        self.terminated = False
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        observation, _ = self.env.reset(seed=seed, options=options)
-        return observation, {}
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        space = self.env.action_space
-        if isinstance(space, gymnasium.spaces.Box):
-            action = np.clip(action, space.low, space.high)
-        self.last, _, self.terminated, truncated, _ = self.env.step(action)
-        # A reward that is not used, and no info, which would be copied into every step.
-        return self.last, 0.0, self.terminated, truncated, {}
-
-
-def _clip(space: gymnasium.Space[Any], action: Tensor) -> Tensor:
-    """Actions as an :class:`_Ending` carries them out; a Gaussian policy knows no bounds."""
-    if not isinstance(space, gymnasium.spaces.Box):
-        return action
-    return action.clamp(torch.from_numpy(space.low), torch.from_numpy(space.high)).to(action.dtype)
 
 
 def _check_numbers(
@@ -315,33 +289,6 @@ def _act(
     return output + spec.action_std * torch.randn(output.shape, generator=generator)
 
 
-def _roll(
-    envs: Sequence[_Ending],
-    act: Callable[[TensorDictBase], Tensor],
-    *,
-    max_steps: int,
-    generator: torch.Generator,
-) -> TensorDict:
-    """Steps ``[S]`` of one episode in each environment, one episode after the other."""
-    seeds = torch.randint(2**31, (len(envs),), generator=generator).tolist()
-    episodes = lockstep(envs, act, seeds=seeds, max_steps=max_steps)
-    mask = episodes[MASK]
-    rows, last = torch.arange(len(envs)), mask.sum(1) - 1
-    # What follows a step is seen at the next one, but for the last, whose outcome is elsewhere.
-    following = episodes[OBSERVATION].roll(-1, 1)
-    following[rows, last] = torch.stack(
-        [torch.as_tensor(env.last, dtype=following.dtype) for env in envs]
-    )
-    done, terminated = torch.zeros(2, *mask.shape, 1, dtype=torch.bool)
-    done[rows, last] = True
-    terminated[rows, last, 0] = torch.tensor([env.terminated for env in envs])
-    episodes = episodes.select(OBSERVATION, ACTION)
-    episodes["next"] = TensorDict(
-        {OBSERVATION: following, "done": done, "terminated": terminated}, episodes.batch_size
-    )
-    return episodes[mask]
-
-
 @torch.no_grad()
 def _rewards(reward: RewardFunction, observation: Tensor, action: Tensor) -> Tensor:
     gain = reward(observation, action)
@@ -361,13 +308,3 @@ def _rewards(reward: RewardFunction, observation: Tensor, action: Tensor) -> Ten
             f"ones in {len(gain)} steps; look at the network it comes from"
         )
     return gain.float()
-
-
-def _running_returns(gain: Tensor, done: Tensor, discount: float) -> Tensor:
-    """Discounted sum of an episode's rewards up to each step, ``[S, 1]``."""
-    sums, total = [], 0.0
-    for value, ends in zip(gain.tolist(), done.tolist(), strict=True):
-        total = discount * total + value
-        sums.append(total)
-        total = 0.0 if ends else total
-    return torch.tensor(sums).unsqueeze(-1)
