@@ -12,7 +12,8 @@ import hashlib
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -23,6 +24,7 @@ __all__ = [
     "Kind",
     "behaviour",
     "env",
+    "isolated",
     "method",
     "names",
     "rater",
@@ -307,3 +309,22 @@ def _attribute(kind: Kind, reference: str, module: ModuleType, name: str) -> Any
         f"{kind} {reference!r}: {module.__file__} has no {name!r}.{guess} It defines: "
         f"{', '.join(own) or 'nothing'}."
     )
+
+
+@contextmanager
+def isolated() -> Iterator[None]:
+    """Start with nothing decorated and forget afterwards what was: for tests of plug-ins.
+
+    Names that installed packages declare stay known, as in a new process.
+    """
+    kept = {kind: dict(found) for kind, found in _registered.items()}
+    for found in _registered.values():
+        found.clear()
+    _entry_points.cache_clear()
+    try:
+        yield
+    finally:
+        for kind, found in kept.items():
+            _registered[kind].clear()
+            _registered[kind].update(found)
+        _entry_points.cache_clear()

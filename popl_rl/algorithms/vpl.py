@@ -29,6 +29,7 @@ from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.population import Population
 from popl_rl.models.schedules import linear_decay
 from popl_rl.models.scoring import case_values, rater_accuracy
+from popl_rl.selection.farthest_first import farthest_first
 
 __all__ = ["VPL", "AnswerEncoder", "EncodedPolicySet", "divergence", "spread_points"]
 
@@ -50,14 +51,13 @@ def spread_points(points: Tensor, count: int) -> Tensor:
     Returns:
         Different rows, ``[min(count, C)]``, int64.
     """
-    count = min(count, len(points))
-    chosen = [int((points - points.mean(0)).norm(dim=1).argmax())]
-    nearest = torch.full((len(points),), torch.inf, device=points.device)
-    for _ in range(count - 1):
-        nearest = torch.minimum(nearest, (points - points[chosen[-1]]).norm(dim=1))
-        nearest[chosen[-1]] = -torch.inf
-        chosen.append(int(nearest.argmax()))
-    return torch.tensor(chosen, device=points.device)
+    return farthest_first(
+        lambda some, others: -(points[some, None] - points[others]).norm(dim=-1),
+        len(points),
+        min(count, len(points)),
+        first=int((points - points.mean(0)).norm(dim=1).argmax()),
+        device=points.device,
+    )
 
 
 class AnswerEncoder(nn.Module):

@@ -14,6 +14,7 @@ from popl_rl.selection import rules as selection
 from popl_rl.selection.rules import (
     SELECTIONS,
     best_sum_selection,
+    fronts_and_crowding,
     nsga2_selection,
     random_selection,
     report,
@@ -77,7 +78,7 @@ def test_fronts_and_crowding_on_paper():
     In the first front 0 and 2 are at the ends. On each case the neighbours of member 1 are these
     two, as far apart as the front is wide; pymoo takes the mean over the cases, (1 + 1) / 2.
     """
-    front, crowding = selection._fronts(VALUES)
+    front, crowding = fronts_and_crowding(VALUES)
     assert front.tolist() == [0, 0, 0, 1]
     assert crowding[:3].tolist() == [torch.inf, 1.0, torch.inf]
 
