@@ -41,7 +41,7 @@ def wheel(tmp_path_factory):
     source = folder / "source"
     source.mkdir()
     # Built from a copy, so that nothing is left behind in the checkout.
-    for name in (*TREES, "pyproject.toml", "README.md"):
+    for name in (*TREES, "pyproject.toml", "README.md", "LICENSE"):
         (source / name).symlink_to(ROOT / name)
     build = ["-m", "build", "--wheel", "--no-isolation", "--outdir", folder / "dist"]
     execute(sys.executable, *build, cwd=source)
@@ -61,6 +61,12 @@ def test_the_wheel_holds_the_tree(wheel):
         found = {name: archive.read(name) for name in names}
     assert set(found) == set(expected)
     assert found == expected
+
+
+def test_the_wheel_holds_the_licence(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        [name] = [name for name in archive.namelist() if name.endswith("/licenses/LICENSE")]
+        assert archive.read(name) == (ROOT / "LICENSE").read_bytes()
 
 
 def test_the_wheel_works_elsewhere(wheel, tmp_path, tiny):

@@ -1,0 +1,187 @@
+"""Tables of results in READMEs, written from committed rows of benchmarks."""
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from popl_rl.evaluation.statistics import interval, require_columns
+from popl_rl.experiments.markdown import markdown_table
+
+__all__ = ["COLUMNS", "ResultTable", "fill_tables", "make_tables", "read_tables", "rows_for"]
+
+#: Columns of the rows of a benchmark.
+COLUMNS = ["suite", "scenario", "seed", "method", "choice", "group", "measure", "value"]
+
+_MARKED = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class ResultTable:
+    """One measure of methods (rows) in scenarios (columns), for the group served worst.
+
+    Attributes:
+        suite: The suite whose rows it shows.
+        measure: The measure, as in ``results.csv``.
+        methods: ``(method, choice)`` -> what the row is called.
+        scenarios: Scenario -> what the column is called.
+    """
+
+    suite: str
+    measure: str
+    methods: Mapping[tuple[str, str], str]
+    scenarios: Mapping[str, str]
+
+    def rows(self, results: pd.DataFrame) -> pd.DataFrame:
+        """Rows that the table is made from.
+
+        Args:
+            results: Rows with the columns :data:`COLUMNS`.
+
+        Returns:
+            Those of its suite, measure, scenarios and methods, one for each group.
+
+        Raises:
+            ValueError: If ``results`` lacks a column.
+        """
+        require_columns(results, COLUMNS)
+        # Without a single choice, pandas reads the column as numbers.
+        choice = results["choice"].astype(object).where(results["choice"].notna(), "")
+        rows = results.assign(choice=choice)
+        pairs = pd.Series(list(zip(rows["method"], rows["choice"], strict=True)), rows.index)
+        return rows[
+            (rows["suite"] == self.suite)
+            & (rows["measure"] == self.measure)
+            & (rows["group"] != "all")
+            & rows["scenario"].isin(list(self.scenarios))
+            & pairs.isin(list(self.methods))
+        ]
+
+    def markdown(self, results: pd.DataFrame) -> str:
+        """Lay the table out.
+
+        Args:
+            results: Rows with the columns :data:`COLUMNS`.
+
+        Returns:
+            The table; a cell is mean ± 95 % interval over seeds [lowest], or – without rows.
+
+        Raises:
+            ValueError: If ``results`` lacks a column.
+        """
+        rows = self.rows(results)
+        lines = []
+        for (method, choice), label in self.methods.items():
+            own = rows[(rows["method"] == method) & (rows["choice"] == choice)]
+            cells = [_cell(own[own["scenario"] == scenario]) for scenario in self.scenarios]
+            lines.append([label, *cells])
+        head = ["method", *self.scenarios.values()]
+        return markdown_table(head, lines, right=len(self.scenarios))
+
+
+def read_tables(path: Path) -> dict[str, ResultTable]:
+    """Read which tables there are.
+
+    Args:
+        path: A TOML file with a section for each table: ``suite``, ``measure``, ``methods`` (a list
+            of ``[method, choice, label]``) and ``scenarios`` (name = title).
+
+    Returns:
+        The tables by name.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is no TOML, or a table is not described like that.
+    """
+    tables = {}
+    for name, about in tomllib.loads(path.read_text(encoding="utf-8")).items():
+        try:
+            methods = {(method, choice): label for method, choice, label in about["methods"]}
+            tables[name] = ResultTable(
+                about["suite"], about["measure"], methods, about["scenarios"]
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"table {name!r} in {path} must have suite, measure, methods as a list of [method, "
+                f"choice, label], and scenarios, got {about!r}; correct or remove it"
+            ) from error
+    return tables
+
+
+def rows_for(tables: Mapping[str, ResultTable], results: pd.DataFrame) -> pd.DataFrame:
+    """Keep of a benchmark's rows what its tables need, in their order.
+
+    Args:
+        tables: Tables by name.
+        results: Rows with the columns :data:`COLUMNS`.
+
+    Returns:
+        Rows with these columns alone.
+
+    Raises:
+        ValueError: If ``results`` lacks a column.
+    """
+    require_columns(results, COLUMNS)
+    needed = [index for table in tables.values() for index in table.rows(results).index]
+    return results.loc[sorted(set(needed)), COLUMNS]
+
+
+def make_tables(tables: Mapping[str, ResultTable], folder: Path) -> dict[str, str]:
+    """Lay out all tables from the rows in a folder.
+
+    Args:
+        tables: Tables by name.
+        folder: Where ``<suite>.csv`` are; a suite without one has not been run.
+
+    Returns:
+        Markdown by name of the table.
+
+    Raises:
+        ValueError: If a file lacks a column.
+    """
+    nothing = pd.DataFrame(columns=COLUMNS)
+    rows = {
+        table.suite: pd.read_csv(path) if path.is_file() else nothing
+        for table in tables.values()
+        for path in [folder / f"{table.suite}.csv"]
+    }
+    return {name: table.markdown(rows[table.suite]) for name, table in tables.items()}
+
+
+def fill_tables(text: str, tables: Mapping[str, str]) -> str:
+    """Replace what stands between ``<!-- table: NAME -->`` and ``<!-- end -->``.
+
+    Args:
+        text: A Markdown file.
+        tables: Markdown of each table, by name.
+
+    Returns:
+        The text with these tables.
+
+    Raises:
+        ValueError: If the text asks for a table that is not in ``tables``.
+    """
+    unknown = sorted({match[2] for match in _MARKED.finditer(text)} - set(tables))
+    if unknown:
+        raise ValueError(
+            f"the text must name tables among {sorted(tables)}, got {unknown}; correct the name "
+            "after '<!-- table:' or describe the table"
+        )
+    return _MARKED.sub(lambda match: f"{match[1]}{tables[match[2]]}\n{match[3]}", text)
+
+
+def _cell(rows: pd.DataFrame) -> str:
+    worst = rows.groupby("seed")["value"].min()
+    if worst.empty:
+        return "–"
+    mean, half = interval(worst.to_numpy())
+    spread = f" ± {half:.2f}" if len(worst) > 1 else ""
+    return f"{_number(mean)}{spread} [{_number(float(worst.min()))}]"
+
+
+def _number(value: float) -> str:
+    # Rounded first, so that nothing is written as a negative zero.
+    return f"{round(value, 2) + 0.0:.2f}".replace("-", "−")

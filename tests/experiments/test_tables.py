@@ -1,0 +1,86 @@
+import pandas as pd
+import pytest
+
+from popl_rl.experiments.tables import (
+    COLUMNS,
+    ResultTable,
+    fill_tables,
+    make_tables,
+    read_tables,
+    rows_for,
+)
+
+
+def test_a_cell_is_the_worst_group_over_seeds():
+    """Worst groups 0.4 and 0.6: mean 0.5, standard error 0.1, t(0.975, 1) = 12.706."""
+    rows = [
+        ("s", "two", seed, "popl", "", group, "recovery", value)
+        for seed, group, value in [(0, "a", 0.4), (0, "b", 0.9), (1, "a", 0.8), (1, "b", 0.6)]
+    ]
+    table = ResultTable("s", "recovery", {("popl", ""): "`popl`"}, {"two": "two", "three": "three"})
+    lines = table.markdown(pd.DataFrame(rows, columns=COLUMNS)).splitlines()
+    assert lines[-1] == "| `popl` | 0.50 ± 1.27 [0.40] | – |"
+
+
+@pytest.mark.parametrize(("value", "shown"), [(-0.004, "0.00"), (-0.5, "−0.50"), (1.0, "1.00")])
+def test_numbers_have_two_decimals_and_a_minus_sign(value, shown):
+    rows = pd.DataFrame([("s", "two", 0, "cpl", "", "a", "return", value)], columns=COLUMNS)
+    table = ResultTable("s", "return", {("cpl", ""): "pooled CPL"}, {"two": "two"})
+    assert table.markdown(rows).endswith(f"| {shown} [{shown}] |")
+
+
+def test_marked_tables_are_replaced_and_nothing_else():
+    text = "before\n<!-- table: t -->\nold\n<!-- end -->\nafter\n"
+    filled = fill_tables(text, {"t": "| new |"})
+    assert filled == "before\n<!-- table: t -->\n| new |\n<!-- end -->\nafter\n"
+    assert fill_tables(filled, {"t": "| new |"}) == filled
+
+
+def test_an_unknown_table_is_named():
+    with pytest.raises(ValueError, match="'u'"):
+        fill_tables("<!-- table: u -->\n<!-- end -->", {"t": ""})
+
+
+@pytest.fixture
+def described(tmp_path):
+    path = tmp_path / "tables.toml"
+    path.write_text(
+        '[t]\nsuite = "s"\nmeasure = "recovery"\nmethods = [["cpl", "", "pooled CPL"]]\n'
+        'scenarios = {two = "two groups"}\n'
+    )
+    return path
+
+
+def test_tables_are_described_in_a_file(described):
+    [table] = read_tables(described).values()
+    assert table == ResultTable("s", "recovery", {("cpl", ""): "pooled CPL"}, {"two": "two groups"})
+
+
+def test_a_table_without_a_measure_is_named(tmp_path):
+    path = tmp_path / "tables.toml"
+    path.write_text('[broken]\nsuite = "s"\nmethods = []\nscenarios = {}\n')
+    with pytest.raises(ValueError, match="'broken'"):
+        read_tables(path)
+
+
+def test_only_rows_that_a_table_shows_are_kept(described):
+    rows = pd.DataFrame(
+        [
+            ("s", "two", 0, "cpl", "", "a", "recovery", 0.5),
+            ("s", "two", 0, "cpl", "", "all", "recovery", 0.5),
+            ("s", "two", 0, "cpl", "", "a", "accuracy", 0.6),
+            ("s", "three", 0, "cpl", "", "a", "recovery", 0.7),
+            ("s", "two", 0, "cpl", "lexicase", "a", "recovery", 0.8),
+            ("other", "two", 0, "cpl", "", "a", "recovery", 0.9),
+        ],
+        columns=COLUMNS,
+    )
+    tables = read_tables(described)
+    assert rows_for(tables, rows).values.tolist() == rows.head(1).values.tolist()
+    rows.to_csv(described.parent / "s.csv", index=False)
+    assert make_tables(tables, described.parent)["t"].endswith("| pooled CPL | 0.50 [0.50] |")
+
+
+def test_a_suite_that_was_not_run_has_empty_cells(described):
+    made = make_tables(read_tables(described), described.parent)
+    assert made["t"].endswith("| pooled CPL | – |")
