@@ -12,7 +12,7 @@ from popl_rl.data.rollouts import MASK, lockstep
 from popl_rl.keys import ANSWER, INFO, OBSERVATION, PAIR, Answer
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.raters.groups import RaterGroup
-from popl_rl.raters.pairs import draw_pairs
+from popl_rl.raters.pairs import PairPool
 from popl_rl.raters.people import Raters
 
 __all__ = [
@@ -157,7 +157,7 @@ def held_out_pairs(
     group: int,
     *,
     count: int,
-    start: Tensor | None = None,
+    pool: PairPool | None = None,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
     """Fresh pairs on which a group has a strict opinion, and no rater's noise.
@@ -166,13 +166,14 @@ def held_out_pairs(
         segment_utility: Worth of each stored segment to each group, ``[G, N]``.
         group: Which group.
         count: Pairs to draw; those of (nearly) equal worth are dropped.
-        start: Which segments may be compared, ``[N]``; all if None.
+        pool: What pairs are drawn from; all pairs of the N segments if None.
         generator: Source of the pairs.
 
     Returns:
         Preferred and other segments, each ``[count or fewer]``.
     """
-    pair = draw_pairs(segment_utility.shape[1], count, start=start, generator=generator)
+    pool = PairPool(segment_utility.shape[1]) if pool is None else pool
+    pair = pool.draw(count, generator=generator)
     first, second = segment_utility[group][pair].unbind(-1)
     strict = (first - second).abs() > 1e-6
     swap = (first < second)[strict]
@@ -201,7 +202,7 @@ def new_rater_answers(
     segment_utility: Tensor,
     *,
     answers: int,
-    start: Tensor | None = None,
+    pool: PairPool | None = None,
     generator: torch.Generator,
 ) -> TensorDict:
     """Strict answers of a new rater of one group, noisy as that group's raters are.
@@ -211,7 +212,7 @@ def new_rater_answers(
         group: The new rater's group.
         segment_utility: ``[G, N]``.
         answers: Number of strict answers; ties and skips are asked again.
-        start: Which segments may be compared, ``[N]``; all if None.
+        pool: What pairs are drawn from; all pairs of the N segments if None.
         generator: Source of the pairs and of the rater's randomness.
 
     Returns:
@@ -220,10 +221,11 @@ def new_rater_answers(
     Raises:
         ValueError: If the rater keeps answering ties and skips.
     """
+    pool = PairPool(segment_utility.shape[1]) if pool is None else pool
     person = Raters(tuple(groups), torch.tensor([group]))
     pairs, replies, found = [], [], 0
     for _ in range(100):
-        pair = draw_pairs(segment_utility.shape[1], answers, start=start, generator=generator)
+        pair = pool.draw(answers, generator=generator)
         asked = torch.zeros(answers, dtype=torch.long)
         reply = person.answer(pair, asked, segment_utility, generator=generator)
         strict = reply <= Answer.SECOND

@@ -7,11 +7,12 @@ from popl_rl.data.environments import World, is_stateless
 from popl_rl.evaluation.acting import Acting, Choosing, Optimising, Planning, Rolling
 from popl_rl.evaluation.evaluator import Evaluator
 from popl_rl.experiments.builders import Data, build_bank, fresh_segments
+from popl_rl.keys import PAIR
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.raters.groups import RaterGroup
-from popl_rl.raters.pairs import starts_of
+from popl_rl.raters.pairs import held_out_pool
 
 __all__ = ["make_evaluator"]
 
@@ -74,7 +75,7 @@ def make_evaluator(
         groups,
         bank,
         data.segment_utility,
-        start=starts_of(data.steps),
+        pool=held_out_pool(data.steps, data.preferences[PAIR]),
         clone=clone,
         shares=config.raters.shares,
         seed=seed,
