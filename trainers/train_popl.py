@@ -25,7 +25,7 @@ from popl_rl.algorithms.reward_baselines import train_reward_baselines
 from popl_rl.algorithms.trainer import POPLTrainer
 from popl_rl.config import Config, validate
 from popl_rl.data.comparisons import Comparisons
-from popl_rl.data.environments import build_world, is_stateless
+from popl_rl.data.environments import build_world, indexed, is_stateless
 from popl_rl.evaluation.diagnostics import alarm, diagnostics
 from popl_rl.evaluation.results import Scoreboard
 from popl_rl.experiments.builders import (
@@ -110,7 +110,7 @@ def run(config: Config) -> Result:
     if config.data.save:
         data.save(kept)
     spec = build_spec(config.method, world.env)
-    bank = build_bank(data.steps, spec).to(config.device)
+    bank = build_bank(indexed(data.steps, world.env.action_space), spec).to(config.device)
     comparisons = Comparisons.from_preferences(data.preferences, cases=config.method.cases)
     comparisons = comparisons.to(config.device)
     clone: StyleClone | None = None

@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from popl_rl.data.behaviours import first_action
 from popl_rl.data.rollouts import MASK, lockstep
 from popl_rl.keys import ANSWER, INFO, OBSERVATION, PAIR, Answer
 from popl_rl.models.policy_set import PolicySet
@@ -52,7 +53,8 @@ def roll_out(
         random_action: A behaviour to roll without policies.
 
     Returns:
-        TensorDict ``[P, E, H]`` as from :func:`~popl_rl.data.rollouts.lockstep`.
+        TensorDict ``[P, E, H]`` as from :func:`~popl_rl.data.rollouts.lockstep`; discrete actions
+        are those of the environment, which need not begin with 0.
 
     Raises:
         ValueError: If ``episodes`` or ``max_steps`` is not positive, or there is nothing to roll.
@@ -72,15 +74,16 @@ def roll_out(
         if isinstance(policies, Tensor):
             state = step[INFO, "next_state"].long().view(count, episodes)
             rows = policies[torch.arange(count).unsqueeze(1), state].flatten(0, 1)
-            return torch.multinomial(rows, 1, generator=generator).squeeze(-1)
+            return first + torch.multinomial(rows, 1, generator=generator).squeeze(-1)
         if policies is not None:
             observation = step[OBSERVATION].view(count, episodes, -1).to(device)
             action = policies.act(observation, greedy=greedy, generator=generator)
-            return action.flatten(0, 1).cpu()
+            return first + action.flatten(0, 1).cpu()
         assert random_action is not None
         return random_action(step, generator)
 
     envs = [make_env() for _ in range(count * episodes)]
+    first = first_action(envs[0].action_space)
     try:
         flat = lockstep(envs, act, seeds=starts * count, max_steps=max_steps)
     finally:
@@ -93,16 +96,28 @@ def group_returns(episodes: TensorDictBase, groups: Sequence[RaterGroup]) -> Ten
     """Mean undiscounted utility of an episode to each group.
 
     Args:
-        episodes: ``[P, E, H]``.
+        episodes: ``[P, E, H]``. What stands after an episode's end is not shown to the groups,
+            whose utilities may be undefined there.
         groups: G groups.
 
     Returns:
         ``[P, G]``.
     """
     flat = episodes.flatten(0, 1)
-    mask = flat[MASK].float()
-    segment_utility = [(group.step_utility(flat) * mask).sum(1) for group in groups]
-    return torch.stack(segment_utility, -1).view(*episodes.shape[:2], -1).mean(1)
+    mask = flat[MASK]
+    shown = _with_last_step_repeated(flat)
+    returns = [torch.where(mask, group.step_utility(shown), 0).sum(1) for group in groups]
+    return torch.stack(returns, -1).view(*episodes.shape[:2], -1).mean(1)
+
+
+def _with_last_step_repeated(episodes: TensorDictBase) -> TensorDictBase:
+    """Episodes ``[B, H]`` whose last real step stands in the place of what follows its end too."""
+    mask = episodes[MASK]
+    if bool(mask.all()):
+        return episodes
+    last = mask.sum(1, keepdim=True) - 1
+    step = torch.arange(mask.shape[1]).minimum(last)
+    return episodes[torch.arange(len(mask)).unsqueeze(1), step]
 
 
 def info_rates(episodes: TensorDictBase, key: str) -> dict[int, Tensor]:

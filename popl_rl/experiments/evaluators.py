@@ -3,7 +3,7 @@
 import torch
 
 from popl_rl.config import Config
-from popl_rl.data.environments import World, is_stateless
+from popl_rl.data.environments import World, indexed, is_stateless
 from popl_rl.evaluation.acting import Acting, Choosing, Optimising, Planning, Rolling
 from popl_rl.evaluation.evaluator import Evaluator
 from popl_rl.experiments.builders import Data, build_bank, fresh_segments
@@ -47,7 +47,7 @@ def make_evaluator(
     device, options = config.device, config.evaluation
     if is_stateless(world.env):
         segments = fresh_segments(config.data, world, seed=seed, env=config.env)
-        bank = build_bank(segments, spec).to(device)
+        bank = build_bank(indexed(segments, world.env.action_space), spec).to(device)
         segment_utility = torch.stack([group.segment_utility(segments) for group in groups])
         chooser = Choosing(segments, bank, options, seed=seed)
         return Evaluator(
@@ -60,7 +60,7 @@ def make_evaluator(
             shares=config.raters.shares,
             seed=seed,
         )
-    bank = build_bank(data.steps, spec).to(device)
+    bank = build_bank(indexed(data.steps, world.env.action_space), spec).to(device)
     acting: Acting = Rolling(world, config.env, options, seed=seed)
     if isinstance(spec, RewardSpec):
         can_plan = world.table is not None and options.optimiser != "ppo"

@@ -1,6 +1,6 @@
 """Which pairs of segments are compared, in training and in evaluation.
 
-Nobody is asked the same pair twice over the two: where segments say which state they go on from,
+No pair is asked about in both: where segments say which state they go on from,
 the last fifth of these states is kept for evaluation; elsewhere a pair that was asked in training
 is left out of evaluation.
 """
@@ -174,4 +174,5 @@ def _is_held_out(start: Tensor) -> Tensor:
             f"segments must go on from at least {count + 1} starts, of which {count} are kept for "
             f"evaluation, got {len(starts)}; collect more segments (data.segments)"
         )
-    return start >= starts[-count]
+    kept: Tensor = start >= starts[-count]
+    return kept
