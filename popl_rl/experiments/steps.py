@@ -16,7 +16,7 @@ from popl_rl.algorithms.reward_baselines import RewardBaselines, train_reward_ba
 from popl_rl.algorithms.trainer import MethodTrainer
 from popl_rl.config import Config, plain, validate
 from popl_rl.data.comparisons import Comparisons
-from popl_rl.data.environments import World, build_world, is_stateless
+from popl_rl.data.environments import World, build_world, indexed, is_stateless
 from popl_rl.evaluation.diagnostics import diagnostics
 from popl_rl.evaluation.evaluator import Evaluator
 from popl_rl.evaluation.results import Scoreboard
@@ -139,7 +139,7 @@ def gather(config: Config, run_dir: Path) -> Setting:
     if config.data.save:
         data.save(kept)
     spec = build_spec(config.method, world.env)
-    bank = spec.bank(data.steps).to(config.device)
+    bank = spec.bank(indexed(data.steps, world.env.action_space)).to(config.device)
     comparisons = Comparisons.from_preferences(data.preferences, cases=config.method.cases)
     clone, typical = None, None
     if config.method.evolve == "code" or config.evaluation.reference == "clone":
