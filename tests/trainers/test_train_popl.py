@@ -8,10 +8,10 @@ import torch
 from omegaconf import OmegaConf
 
 from popl_rl.algorithms.vpl import EncodedPolicySet
-from popl_rl.randomness import stream
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.population import Population
+from popl_rl.randomness import stream
 from popl_rl.trainers.train_popl import run, show
 
 MIXTURES = [
