@@ -46,6 +46,9 @@ class Comparisons:
                 ``rater``.
             cases: ``"preference"`` or ``"rater"``.
 
+        Returns:
+            The M' strict ones, each with its case; raters' cases are numbered from 0.
+
         Raises:
             ValueError: If ``cases`` is neither, rater ids are needed and missing, or no answer is
                 strict.

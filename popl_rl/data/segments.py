@@ -155,6 +155,9 @@ def segment_buffer(
         segments: ``[N, T]``.
         memmap: Folder for memory-mapped storage; in memory if None.
         batch_size: Segments per ``sample()``.
+
+    Returns:
+        A buffer of N items, in the order of ``segments``.
     """
     size = len(segments)
     storage = (

@@ -99,7 +99,7 @@ def solve(
     Args:
         table: The transitions.
         reward: ``[S, A]`` float, what each step is worth.
-        discount: Worth of the next step relative to this one, in (0, 1].
+        discount: Factor of the next step's value relative to this one's, in (0, 1].
         temperature: Weight of the entropy; 0 takes the best action.
 
     Returns:

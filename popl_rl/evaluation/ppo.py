@@ -104,7 +104,7 @@ def train_ppo(
         frames_per_batch: Least number of steps between two updates; episodes are completed.
         num_envs: Environments that advance together.
         max_steps: Steps after which an episode is cut.
-        discount: Worth of the next step relative to this one.
+        discount: Factor of the next step's reward relative to this one's.
         gae_lambda: Decay of the generalised advantage estimate (arXiv 1506.02438): 0 trusts the
             critic, 1 what happened.
         clip_epsilon: How far a ratio of probabilities may leave 1 before it gains nothing more.

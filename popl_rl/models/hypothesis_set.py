@@ -62,7 +62,7 @@ class HypothesisSet:
         self.origin = list(range(len(population)))
 
     def distinct(self, bank: SegmentBank, comparisons: Comparisons) -> Self:
-        """Keep one member for each distinct behaviour (pass or not, on every comparison)."""
+        """Keep one member for each distinct row of passes ``[M]``, the first with that row."""
         passes = self._margins(bank, comparisons) > 0
         inverse = torch.unique(passes, dim=0, return_inverse=True)[1].tolist()
         first = sorted({behaviour: inverse.index(behaviour) for behaviour in inverse}.values())
@@ -125,8 +125,12 @@ class HypothesisSet:
             mistake: Chance of a slip, which keeps single answers from ruling a policy out.
             generator: Source of the lexicase draw.
 
+        Returns:
+            The chosen member, and the belief in each, ``[N]``.
+
         Raises:
-            ValueError: If no answer is strict, or the arguments are off.
+            ValueError: If no answer is strict, ``method`` is unknown, ``mistake`` is outside
+                [0, 0.5) or ``generator`` is missing.
         """
         comparisons = Comparisons.from_preferences(answers, cases="preference")
         margin = self._margins(segments, comparisons).cpu()
@@ -154,6 +158,9 @@ class HypothesisSet:
             answers: TensorDict ``[M]`` with ``pair``, ``answer`` and ``rater``.
             quantile: Quantile over raters of its accuracy that is maximised; 0.1 as in the
                 POPL paper, 0 for the minimum.
+
+        Returns:
+            The chosen member.
 
         Raises:
             ValueError: If ``quantile`` is outside [0, 1] or no answer is strict.
@@ -238,7 +245,7 @@ class HypothesisSet:
         return loaded
 
     def subset(self, members: Sequence[int]) -> Self:
-        """Some of them, in the given order."""
+        """Some of the hypotheses, in the given order."""
         chosen = type(self)(
             self.population.subset(members), alpha=self.alpha, discount=self.discount
         )

@@ -134,7 +134,7 @@ class PolicySpec:
         return output.log_softmax(-1)
 
     def step_scores(self, output: Tensor, action: Tensor) -> Tensor:
-        """See :func:`log_prob`."""
+        """Log-probabilities of actions, ``[...]``; see :func:`log_prob`."""
         return log_prob(self, output, action)
 
     def conservatism(self, value: float) -> float:
@@ -172,7 +172,10 @@ def build_network(spec: Spec, *, generator: torch.Generator) -> nn.Sequential:
 
 
 def build_actor(spec: PolicySpec, network: nn.Module) -> ProbabilisticActor:
-    """Wrap a network as a TorchRL actor that reads ``observation`` and writes ``action``."""
+    """Wrap a network ``[..., O] -> [..., K]`` as a TorchRL actor.
+
+    It reads ``observation`` and writes ``action``, ``[...]`` if discrete, else ``[..., A]``.
+    """
     if spec.discrete:
         module = TensorDictModule(network, in_keys=[OBSERVATION], out_keys=["logits"])
         return ProbabilisticActor(module, in_keys=["logits"], distribution_class=Categorical)

@@ -82,6 +82,9 @@ class RewardSpec:
         Args:
             output: ``[..., K]``.
             action: ``[...]`` int64, broadcast to ``output``.
+
+        Returns:
+            ``[...]``.
         """
         chosen = action.expand(output.shape[:-1]).unsqueeze(-1)
         return output.gather(-1, chosen).squeeze(-1)
@@ -99,7 +102,7 @@ def reward_bank(segments: TensorDictBase) -> SegmentBank:
     """Index segments ``[N, T]`` for reward functions.
 
     Continuous actions ``[N, T, A]`` are joined to the observations, so that the reward depends on
-    both; discrete ones choose an output.
+    both, ``[U, O + A]``; discrete ones choose an output.
     """
     action = segments[ACTION]
     if not action.is_floating_point():

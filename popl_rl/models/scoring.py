@@ -205,13 +205,13 @@ def margins(
 
     Args:
         population: N members.
-        bank: Segments.
+        bank: Segments that the comparisons refer to.
         comparisons: M comparisons.
-        alpha: Scale of the scores.
-        discount: Per-step discount of the scores.
+        alpha: Scale of the scores, as for :func:`segment_scores`.
+        discount: Per-step discount.
 
     Returns:
-        ``[N, M]``.
+        ``[N, M]`` float32; a positive margin is a pass.
     """
     scores = segment_scores(population, bank, alpha=alpha, discount=discount)
     return scores[:, comparisons.preferred] - scores[:, comparisons.other]
@@ -236,5 +236,9 @@ def rater_accuracy(values: Tensor, quantile: float = 0.1) -> float:
     """A low quantile over cases of the best member's value: is anybody left out?
 
     Needs no group labels: it is small as long as some raters find no member that serves them.
+
+    Args:
+        values: Share of each case's comparisons that each member passes, ``[N, C]``.
+        quantile: Quantile over the cases, in [0, 1].
     """
     return float(values.amax(0).quantile(quantile))

@@ -40,7 +40,8 @@ def farthest_first(
     Returns:
         Indices in the order in which they were kept, ``[count]``, int64.
     """
-    nearest = torch.full((num_points,), -torch.inf, device=device)  # likeness to the nearest kept
+    # Similarity of each point to the nearest one kept.
+    nearest = torch.full((num_points,), -torch.inf, device=device)
     kept = torch.empty(0, dtype=torch.long, device=device)
     new = None if first is None else torch.tensor([first], device=device)
     while True:
