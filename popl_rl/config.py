@@ -1,6 +1,6 @@
 """Schemas of the configuration, with defaults and what they mean, and one check of it all."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -171,8 +171,15 @@ class EvaluateConfig:
     """What popl-evaluate does with a finished run."""
 
     run_dir: str = MISSING  # folder of the run
-    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
-    seed: int = 0  # of the held-out pairs, new raters and episodes
+    # What differs from the run's own settings: MISSING, which merging passes over, is as the run.
+    evaluation: EvaluationConfig = field(
+        default_factory=lambda: EvaluationConfig(
+            **dict.fromkeys((setting.name for setting in fields(EvaluationConfig)), MISSING)
+        )
+    )
+    # Of the held-out pairs, new raters and episodes. The run's seed + 1 if null, which gives other
+    # ones than the run's; the run's seed gives its own.
+    seed: int | None = None
 
 
 @dataclass
