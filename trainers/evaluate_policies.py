@@ -1,4 +1,9 @@
-"""Judge the policies of a finished run again: ``popl-evaluate``.
+"""Evaluate the policies of a finished run again: ``popl-evaluate``.
+
+Everything is as the run's ``config.yaml`` says, but for what is given. Unless a seed is given,
+held-out pairs, new raters and episodes are others than the run's own; the run's seed gives its own
+again, and with it the same rows of ``results.csv`` (without those of B-REX and DPL, which are not
+kept).
 
 popl-evaluate run_dir=runs/<name>                         # as the run did, other raters
 popl-evaluate run_dir=runs/<name> evaluation.answers=5    # cater from five answers
@@ -10,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+import torch
 from omegaconf import OmegaConf
 from rich.console import Console
 
@@ -30,18 +36,21 @@ from popl_rl.trainers.command import register_schemas, run_command
 
 
 def run(config: EvaluateConfig) -> tuple[Path, Scoreboard]:
-    """Judge again; returns the folder that was written and the scoreboard."""
+    """Evaluate again; returns the folder that was written and the scoreboard."""
     run_dir = Path(config.run_dir)
-    stored: Any = OmegaConf.merge(OmegaConf.structured(Config), load_config(run_dir))
-    stored.evaluation = config.evaluation
-    validate(stored)
+    kept = run_dir / "data"
+    stored = _settings(config, run_dir, has_data=kept.is_dir())
+    seed = stored.seed + 1 if config.seed is None else config.seed
+    torch.set_num_threads(stored.threads)
     is_reward = (run_dir / RewardSet.folder).is_dir()
     found = load_set(run_dir / (RewardSet if is_reward else PolicySet).folder)
     base_path = run_dir / "baselines"
-    baselines = load_set(base_path) if base_path.is_dir() else None
+    baselines = None
+    if stored.evaluation.baselines and base_path.is_dir():
+        baselines = load_set(base_path)
     world = build_world(stored.env)
     groups = build_groups(stored.raters, world)
-    kept = run_dir / "data"
+    given = None if stored.data.load is None else Path(stored.data.load)
     data = make_data(
         stored.data,
         stored.raters,
@@ -49,30 +58,46 @@ def run(config: EvaluateConfig) -> tuple[Path, Scoreboard]:
         groups,
         seed=stored.seed,
         env=stored.env,
-        load=kept if kept.is_dir() else None,
+        load=kept if kept.is_dir() else given,
     )
     spec = build_spec(stored.method, world.env)
     path = run_dir / "clone"
     clone = load_set(path) if path.is_dir() else None
-    evaluator = make_evaluator(stored, world, groups, data, spec, clone=clone, seed=config.seed)
+    evaluator = make_evaluator(stored, world, groups, data, spec, clone=clone, seed=seed)
     board = evaluator.score(found, baselines, label=stored.method.name)
     number = 1 + len(list((run_dir / "evaluations").glob("[0-9]*")))
     folder = run_dir / "evaluations" / f"{number:03d}"
     beside = folder.with_name(f".{folder.name}")
     shutil.rmtree(beside, ignore_errors=True)
     beside.mkdir(parents=True)
-    save_config(beside, OmegaConf.structured(config))
+    used = {"run_dir": str(config.run_dir), "evaluation": stored.evaluation, "seed": seed}
+    save_config(beside, used)
     write_atomic(beside / "results.csv", board.results.to_csv(index=False))
     title = f"Evaluation {number} of {run_dir.name}"
     about = {
-        "answers of each new rater": config.evaluation.answers,
-        "seed": config.seed,
+        "answers of each new rater": stored.evaluation.answers,
+        "seed": seed,
         **diagnostics(board, evaluator),
     }
     report = markdown(board.results, title=title, about=about, figures=[])
     write_atomic(beside / "report.md", report)
     beside.rename(folder)
     return folder, board
+
+
+def _settings(config: EvaluateConfig, run_dir: Path, *, has_data: bool) -> Any:
+    """The run's settings with what is given in their place, checked."""
+    settings: Any = OmegaConf.merge(OmegaConf.structured(Config), load_config(run_dir))
+    # Baselines, and data if they were saved, are in the run's folder by now.
+    settings.evaluation.baselines_from = None
+    if has_data:
+        settings.data.load = None
+    # As a plain dictionary: between two configurations of one class, unknown names would pass.
+    asked = OmegaConf.structured(config).evaluation
+    given = {name: asked[name] for name in asked if not OmegaConf.is_missing(asked, name)}
+    settings.evaluation = OmegaConf.merge(settings.evaluation, given)
+    validate(settings)
+    return settings
 
 
 register_schemas()

@@ -1,6 +1,6 @@
 """Settings of a whole run, and one check of it all."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from omegaconf import MISSING, DictConfig, OmegaConf
@@ -30,8 +30,15 @@ class EvaluateConfig:
     """What popl-evaluate does with a finished run."""
 
     run_dir: str = MISSING  # folder of the run
-    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
-    seed: int = 0  # of the held-out pairs, new raters and episodes
+    # What differs from the run's own settings: MISSING, which merging passes over, is as the run.
+    evaluation: EvaluationConfig = field(
+        default_factory=lambda: EvaluationConfig(
+            **dict.fromkeys((setting.name for setting in fields(EvaluationConfig)), MISSING)
+        )
+    )
+    # Of the held-out pairs, new raters and episodes. The run's seed + 1 if null, which gives other
+    # ones than the run's; the run's seed gives its own.
+    seed: int | None = None
 
 
 @dataclass

@@ -1,5 +1,6 @@
 """The data of a run: segments, collected or loaded, and what raters say of them."""
 
+import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,9 +25,12 @@ from popl_rl.raters.pairs import training_pool
 from popl_rl.raters.people import Raters
 from popl_rl.raters.response import Response
 from popl_rl.raters.values import with_values
-from popl_rl.storage import load_tensordict, save_tensordict
+from popl_rl.storage import load_tensordict, save_tensordict, write_json
 
 __all__ = ["Data", "build_groups", "describe", "fresh_segments", "make_data"]
+
+#: Beside saved preferences: names of the groups.
+_ABOUT = "about.json"
 
 
 def build_groups(config: RatersConfig, world: World) -> tuple[RaterGroup, ...]:
@@ -58,12 +62,14 @@ class Data:
         preferences: TensorDict ``[M]``, see :mod:`popl_rl.keys`.
         segment_utility: Worth of each segment to each group, ``[G, N]``; for evaluation only.
         store: Folder that the segments are kept in for all runs, if they are.
+        groups: Names of the groups that were asked, in the order of ``("hidden", "group")``.
     """
 
     segments: TensorDictReplayBuffer
     preferences: TensorDict
     segment_utility: Tensor
     store: Path | None = None
+    groups: tuple[str, ...] = ()
 
     @property
     def steps(self) -> TensorDictBase:
@@ -73,7 +79,8 @@ class Data:
     def save(self, path: Path) -> None:
         """Write segments and preferences below ``path``, replacing nothing.
 
-        Stored segments are not written again: a link leads to them.
+        Stored segments are not written again: a link leads to them. Where preferences say which
+        group each rater is of, ``about.json`` beside them says which groups these are.
         """
         segments = path / "segments"
         if not segments.exists():
@@ -84,6 +91,9 @@ class Data:
                 segments.unlink(missing_ok=True)  # a link that leads nowhere any more
                 segments.symlink_to(os.path.relpath(self.store, path))
         if not (path / "preferences").exists():
+            # First, so that preferences are never without it.
+            if GROUP in self.preferences.keys(True):
+                write_json(path / _ABOUT, {"groups": list(self.groups)})
             save_tensordict(self.preferences, path / "preferences")
 
 
@@ -126,7 +136,8 @@ def make_data(
         progress: Called with the number of segments collected so far.
 
     Raises:
-        ValueError: If there is less data than was asked for, or it does not fit the environment.
+        ValueError: If there is less data than was asked for, it does not fit the environment, or
+            other groups were asked, or in another order, than ``groups``.
     """
     data_seed = seed if config.seed is None else config.seed
     source, folder = None, None if load is None else load / "segments"
@@ -153,6 +164,7 @@ def make_data(
     if raters.label == "regret" and world.table is None:
         groups = with_values(groups, segments, generator=stream(data_seed, "values"))
     segment_utility = torch.stack([group.segment_utility(segments) for group in groups])
+    names = tuple(group.name for group in groups)
     if load is None:
         generator = stream(seed, "raters")
         people = Raters.draw(
@@ -168,12 +180,43 @@ def make_data(
     else:
         preferences = load_preferences(load / "preferences", num_segments=len(segments))
         group = preferences.get(GROUP, None)
-        if group is not None and int(group.max()) >= len(groups):
-            raise ValueError(
-                f"{load} holds preferences of {int(group.max()) + 1} groups, but raters.groups "
-                f"names {len(groups)}; name the groups that were asked then"
-            )
-    return Data(buffer, preferences, segment_utility, source)
+        if group is not None:
+            _check_groups(load, names, numbered=1 + int(group.max()))
+    return Data(buffer, preferences, segment_utility, source, names)
+
+
+def _check_groups(load: Path, names: tuple[str, ...], *, numbered: int) -> None:
+    """Raise unless preferences were given by the groups of these names, in this order.
+
+    Groups are numbers in the preferences. Under other names each group would be measured by what
+    another one wants, and nothing would look wrong.
+    """
+    about = load / _ABOUT
+    try:
+        asked = json.loads(about.read_text(encoding="utf-8"))["groups"]
+        asked = [str(name) for name in asked]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"{about} must say which groups the raters in {load} are of, and is not readable "
+            f"({type(error).__name__}: {error}); data of earlier versions have no such file. "
+            "Collect the data again, or, if raters.groups is what was asked then (see config.yaml "
+            f"of that run), write it yourself: {json.dumps({'groups': list(names)})}"
+        ) from error
+    if numbered > len(asked):
+        raise ValueError(
+            f"{load} holds preferences of {numbered} groups, but {about} names {len(asked)}; the "
+            "two do not belong together, collect the data again"
+        )
+    if asked == list(names):
+        return
+    what = "the same number of them in another order or by other names"
+    if len(asked) != len(names):
+        what = str(len(names))
+    raise ValueError(
+        f"{load} holds preferences of {len(asked)} groups, but raters.groups names {what}; name "
+        f"the groups that were asked then, in that order: expected [{', '.join(asked)}], got "
+        f"[{', '.join(names)}]"
+    )
 
 
 def _load(path: Path, config: DataConfig, world: World) -> TensorDictBase:

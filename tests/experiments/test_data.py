@@ -1,6 +1,7 @@
 """What raters are asked in training, and what nobody is asked before the evaluation."""
 
 import dataclasses
+import json
 
 import pytest
 import torch
@@ -17,7 +18,8 @@ from popl_rl.data.environments import build_world
 from popl_rl.experiments.builders import build_spec
 from popl_rl.experiments.data import build_groups, make_data
 from popl_rl.experiments.evaluators import make_evaluator
-from popl_rl.keys import PAIR
+from popl_rl.keys import GROUP, PAIR
+from popl_rl.storage import save_tensordict
 
 ENV = EnvConfig(factory="popl_rl.testing:tiny_env", max_steps=8)
 LEFT_RIGHT = ["popl_rl.testing:likes_left", "popl_rl.testing:likes_right"]
@@ -87,3 +89,71 @@ def test_no_segment_of_training_is_shown_again_where_segments_have_starts(world,
     assert set((asked // 4).flatten().tolist()) == set(range(16))
     assert set((again // 4).flatten().tolist()) == set(range(16, 20))
     assert len(unordered(asked) & unordered(again)) == 0
+
+
+def asking(*names):
+    references = [f"popl_rl.testing:{name}" for name in names]
+    return dataclasses.replace(RATERS, groups=references)
+
+
+@pytest.fixture
+def saved(world, groups, tmp_path):
+    make_data(DATA, RATERS, world, groups, seed=0, env=ENV).save(tmp_path / "data")
+    return tmp_path / "data"
+
+
+def load(world, raters, folder):
+    groups = build_groups(raters, world)
+    return make_data(DATA, raters, world, groups, seed=0, env=ENV, load=folder)
+
+
+def test_the_groups_that_were_asked_are_kept_by_name(world, saved, tmp_path):
+    assert json.loads((saved / "about.json").read_text())["groups"] == ["likes_left", "likes_right"]
+    load(world, RATERS, saved).save(tmp_path / "again")
+    assert load(world, RATERS, tmp_path / "again").groups == ("likes_left", "likes_right")
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["likes_right", "likes_left"], "another order or by other names; .* in that order: "),
+        (["likes_left", "likes_nothing"], "another order or by other names"),
+        (["likes_left"], "of 2 groups, but raters.groups names 1"),
+        (["likes_left", "likes_right", "likes_nothing"], "of 2 groups, but .* names 3"),
+    ],
+)
+def test_data_of_other_groups_are_refused(world, saved, names, message, monkeypatch):
+    monkeypatch.setattr(
+        "popl_rl.testing.likes_nothing", lambda steps: torch.zeros(steps.shape), raising=False
+    )
+    both = rf"expected \[likes_left, likes_right\], got \[{', '.join(names)}\]"
+    with pytest.raises(ValueError, match=f"{message}.*{both}"):
+        load(world, asking(*names), saved)
+
+
+@pytest.mark.parametrize("text", [None, "not json", "[]", "{}", '{"groups": 3}'])
+def test_data_whose_groups_are_unknown_are_refused_with_a_cure(world, saved, text):
+    (saved / "about.json").unlink()
+    if text is not None:
+        (saved / "about.json").write_text(text)
+    with pytest.raises(
+        ValueError, match=r"Collect the data again, or, .* write it yourself"
+    ) as told:
+        load(world, RATERS, saved)
+    (saved / "about.json").write_text(str(told.value).rpartition("yourself: ")[2])
+    load(world, RATERS, saved)
+
+
+def test_preferences_of_people_name_no_groups(world, groups, tmp_path):
+    data = make_data(DATA, RATERS, world, groups, seed=0, env=ENV)
+    people = data.preferences.exclude(GROUP)
+    save_tensordict(data.steps, tmp_path / "segments")
+    save_tensordict(people, tmp_path / "preferences")
+    load(world, asking("likes_right", "likes_left"), tmp_path).save(tmp_path / "again")
+    assert not (tmp_path / "again" / "about.json").exists()
+
+
+def test_names_of_fewer_groups_than_answered_are_refused(world, saved):
+    (saved / "about.json").write_text('{"groups": ["likes_left"]}')
+    with pytest.raises(ValueError, match=r"of 2 groups, but .*about\.json names 1; the two do not"):
+        load(world, RATERS, saved)

@@ -4,6 +4,8 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
+from omegaconf import OmegaConf
 
 from popl_rl.trainers import evaluate_policies, train_popl
 
@@ -88,12 +90,46 @@ def test_a_run_and_its_evaluations(train, call, tmp_path):
     assert one == other
 
 
-def test_evaluating_with_the_runs_own_settings_gives_its_results(call, finished, copied, tiny):
-    settings = [override for override in tiny if override.startswith("evaluation.")]
-    code, text = call(evaluate_policies.cli, f"run_dir={copied}", *settings)
+def test_evaluating_with_the_runs_seed_gives_its_results(call, finished, copied):
+    code, text = call(evaluate_policies.cli, f"run_dir={copied}", "seed=0")
     assert code == 0, text
     again = (copied / "evaluations" / "001" / "results.csv").read_bytes()
     assert again == (finished / "results.csv").read_bytes()
+
+
+def test_evaluating_keeps_the_runs_settings_and_asks_other_raters(
+    call, finished, copied, monkeypatch
+):
+    found = []
+    original = evaluate_policies.make_evaluator
+
+    def watch(*arguments, **options):
+        found.append(original(*arguments, **options))
+        return found[-1]
+
+    monkeypatch.setattr(evaluate_policies, "make_evaluator", watch)
+    for overrides in (["seed=0"], ["evaluation.answers=3", "evaluation.reference=others"]):
+        code, text = call(evaluate_policies.cli, f"run_dir={copied}", *overrides)
+        assert code == 0, text
+    own = OmegaConf.load(finished / "config.yaml")
+    used = OmegaConf.load(copied / "evaluations" / "002" / "config.yaml")
+    expected = OmegaConf.merge(own.evaluation, {"answers": 3, "reference": "others"})
+    assert used.evaluation == expected
+    assert used.seed == own.seed + 1
+    same, other = found
+    for group in (0, 1):
+        assert not torch.equal(same.pairs[group][0], other.pairs[group][0])
+        for one, another in zip(same.new_raters[group], other.new_raters[group], strict=True):
+            assert not torch.equal(one["pair"][:5], another["pair"][:5])
+    assert same.acting.seed != other.acting.seed
+
+
+def test_evaluating_with_unknown_settings(call, copied):
+    result = call(evaluate_policies.cli, f"run_dir={copied}", "evaluation.anwsers=5")
+    assert_explains(result, "Could not override 'evaluation.anwsers'")
+    result = call(evaluate_policies.cli, f"run_dir={copied}", "+evaluation.anwsers=5")
+    assert_explains(result, "anwsers", "EvaluationConfig")
+    assert not (copied / "evaluations").exists()
 
 
 @pytest.mark.parametrize(
