@@ -19,7 +19,7 @@ from popl_rl.algorithms.rater_similarity import seed_with_specialists
 from popl_rl.algorithms.refinement import RefinementSettings, refine
 from popl_rl.algorithms.variation import GaussianHead, GradientCPL
 from popl_rl.algorithms.vpl import VPL
-from popl_rl.config import ALGORITHMS, EvaluationConfig, MethodConfig, parse_epsilon
+from popl_rl.config import EvaluationConfig, MethodConfig, parse_epsilon
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.data.environments import is_stateless
@@ -283,7 +283,7 @@ def generations_of(config: MethodConfig) -> int:
 
 def label_of(config: MethodConfig) -> str:
     """What the rows of this method are called in ``results.csv``."""
-    return ALGORITHMS[config.algorithm]
+    return config.name
 
 
 def final_set(popl: Learner) -> HypothesisSet:

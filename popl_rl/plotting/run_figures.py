@@ -13,11 +13,14 @@ from popl_rl.algorithms.reward_baselines import RewardBaselines
 from popl_rl.data.environments import World
 from popl_rl.data.rollouts import MASK
 from popl_rl.evaluation.evaluator import Evaluator
+from popl_rl.evaluation.method_names import method_name
 from popl_rl.evaluation.results import Scoreboard
+from popl_rl.evaluation.statistics import headline_measure
 from popl_rl.keys import INFO
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.plotting import run_plots as plots
 from popl_rl.plotting.motion_figures import animate, draw_motion
+from popl_rl.plotting.recovery_plots import recovery_bars
 from popl_rl.plotting.reward_figures import draw_rewards
 from popl_rl.plotting.style import save
 
@@ -76,11 +79,11 @@ def draw(
     }
     if "selection_depth" in metrics:
         figures["selection"] = plots.selection(metrics)
+    # Recovery is open without an oracle, or with one no better than random.
     table = board.results
-    measured = (table.measure == "recovery") & ~table.method.isin(["oracle", "random"])
+    measured = (table.measure == headline_measure(table)) & ~table.method.isin(["oracle", "random"])
     if table.value[measured].notna().any():
-        # Recovery is open without an oracle, or with one no better than random.
-        figures["recovery"] = plots.recovery_bars(
+        figures["recovery"] = recovery_bars(
             board.results, floor=_FLOORS[evaluator.config.reference]
         )
     history = run_dir / "history.csv"
@@ -112,8 +115,10 @@ def draw(
             for name in names
         }
         if baselines is not None:
-            pooled_name = "cpl" if ("cpl", names[0]) in board.episodes else "bradley_terry"
-            title = plots.method_name(pooled_name)
+            pooled_name = (
+                "pooled_cpl" if ("pooled_cpl", names[0]) in board.episodes else "bradley_terry"
+            )
+            title = method_name(pooled_name)
             maps[title] = occupancy_map(board.episodes[pooled_name, names[0]], cells)
         figures["occupancy"] = plots.occupancy(
             picture(world),

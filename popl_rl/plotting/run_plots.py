@@ -19,32 +19,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 from numpy.typing import ArrayLike, NDArray
 
-from popl_rl.evaluation.method_names import METHODS, method_name
 from popl_rl.evaluation.statistics import require_columns
 from popl_rl.plotting.style import LEGEND, MEMBER_COLOURS, PALETTE, headline, legend_beside, tidy
 
 __all__ = [
-    "METHODS",
     "learning_curves",
     "members",
-    "method_name",
     "occupancy",
-    "recovery_bars",
     "selection",
 ]
-
-
-_METHOD_COLOURS = {
-    "popl": PALETTE["blue"],
-    "popl_lexicase": PALETTE["sky"],
-    **dict.fromkeys(("multi_cpl", "em", "vpl"), PALETTE["blue"]),
-    **dict.fromkeys(("multi_cpl_lexicase", "em_lexicase", "vpl_lexicase"), PALETTE["sky"]),
-    "cpl": PALETTE["orange"],
-    "bradley_terry": PALETTE["orange"],
-    "oracle": PALETTE["black"],
-    "random": PALETTE["grey"],
-}
-_OTHERS = (PALETTE["green"], PALETTE["purple"], PALETTE["vermilion"])
 
 
 def occupancy(
@@ -317,87 +300,6 @@ def selection(metrics: pd.DataFrame) -> Figure:
     for ax in (top, bottom):
         ax.set_ylim(bottom=0)
     return fig
-
-
-def recovery_bars(results: pd.DataFrame, *, floor: str = "random actions") -> Figure:
-    """How much of an oracle's return each group gets from each method.
-
-    Args:
-        results: Tidy rows ``method, group, measure, value``; those of measure ``recovery`` are
-            drawn. Several rows of a method and group, such as seeds, are averaged and dotted.
-        floor: What a recovery of 0 is.
-
-    Raises:
-        ValueError: If a column is missing, or no row of measure ``recovery`` holds a number.
-    """
-    require_columns(results, ["method", "group", "measure", "value"])
-    rows = results[(results["measure"] == "recovery") & results["value"].notna()]
-    # By definition 1 and 0 for every group; lines show them.
-    rows = rows[~rows["method"].isin(["oracle", "random"])]
-    if rows.empty:
-        raise ValueError(
-            "results must hold rows of measure 'recovery' of a method other than oracle and "
-            f"random, got measures {sorted(results['measure'].unique())}; run the baselines too"
-        )
-    found = list(rows["method"].unique())
-    methods = [m for m in METHODS if m in found] + [m for m in found if m not in METHODS]
-    groups = list(rows["group"].unique())
-    low = -0.5 if rows["value"].min() < 0 else 0.0
-    high = 1.25
-    fig = Figure(figsize=(max(4.0, len(groups) * (0.5 * len(methods) + 0.4)) + 2.6, 4.2))
-    headline(
-        fig,
-        "How well is each group served?",
-        "Recovery: (return − floor) / (oracle's return − floor), in the group's own utility.",
-    )
-    ax = fig.subplots()
-    width = 0.8 / len(methods)
-    others = itertools.cycle(_OTHERS)
-    for index, method in enumerate(methods):
-        colour = _METHOD_COLOURS.get(method) or next(others)
-        label = method_name(method)
-        for place, group in enumerate(groups):
-            chosen = (rows["method"] == method) & (rows["group"] == group)
-            values = rows.loc[chosen, "value"].to_numpy(dtype=float)
-            if not len(values):
-                continue
-            x = place + (index - (len(methods) - 1) / 2) * width
-            mean = values.mean()
-            ax.bar(x, np.clip(mean, low, high), 0.92 * width, color=colour, label=label)
-            label = "_" + label  # one entry in the legend is enough
-            if len(values) > 1:
-                spread = x + np.linspace(-0.25, 0.25, len(values)) * width
-                ax.scatter(spread, values, s=12, color="white", edgecolors="black", zorder=3)
-            _value(ax, x, mean, values, low, high)
-    ax.axhline(1, color="black", linewidth=1, linestyle="--", zorder=0)
-    ax.axhline(0, color="black", linewidth=1)
-    legend_beside(ax, "as good as the oracle", 1, "black")
-    legend_beside(ax, f"as good as\n{floor}", 0, "black")
-    ax.set_xticks(range(len(groups)), [f"“{group}”" for group in groups])
-    ax.tick_params(axis="x", length=0)
-    ax.set(xlabel="raters who want", ylabel="recovery", ylim=(low and low - 0.2, high + 0.15))
-    fig.legend(loc="outside lower center", ncols=min(len(methods), 3), **LEGEND)
-    tidy(ax)
-    return fig
-
-
-def _value(
-    ax: Axes, x: float, mean: float, values: NDArray[np.float64], low: float, high: float
-) -> None:
-    """Write a bar's value beyond its end, with an arrow where the bar is cut off."""
-    up = mean >= 0
-    end = float(np.clip(values.max() if up else values.min(), low, high))
-    arrow = " ↑" if mean > high else " ↓" if mean < low else ""
-    ax.annotate(
-        f"{mean:.2f}{arrow}".replace("-", "−"),
-        (x, end),
-        xytext=(0, 5 if up else -5),
-        textcoords="offset points",
-        ha="center",
-        va="bottom" if up else "top",
-        fontsize=8,
-        bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6},
-    )
 
 
 def _line(ax: Axes, metrics: pd.DataFrame, column: str, label: str, colour: str) -> None:

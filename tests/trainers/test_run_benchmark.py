@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 
+from popl_rl.evaluation.statistics import RESULT_COLUMNS, read_results
 from popl_rl.experiments import benchmark_report
 from popl_rl.experiments.cells import plan
 from popl_rl.experiments.run_folder import save_config, write_metadata
@@ -62,9 +63,13 @@ class Trainer:
             (folder / "data" / "segments").mkdir(parents=True, exist_ok=True)
             (folder / "baselines").mkdir(exist_ok=True)
         value = 0.9 if config.method.name == "popl" else 0.4
-        rows = [("popl", "upper", "recovery", value - 0.01 * config.seed)]
-        rows += [("popl_lexicase", "upper", "recovery", 0.2), ("cpl", "upper", "recovery", 0.1)]
-        table = pd.DataFrame(rows, columns=["method", "group", "measure", "value"])
+        own, group = config.method.name, ("upper", "recovery")
+        rows = [
+            (own, "posterior", *group, value - 0.01 * config.seed),
+            (own, "lexicase", *group, 0.2),
+            ("pooled_cpl", "", *group, 0.1),
+        ]
+        table = pd.DataFrame(rows, columns=RESULT_COLUMNS)
         table.to_csv(folder / "results.csv", index=False)
 
 
@@ -106,15 +111,15 @@ def test_every_cell_is_run_once_and_the_results_are_put_together(trainer):
     assert trainer.cells[:4] == CELLS
     assert len(trainer.cells) == 8
     assert result.failures == {}
-    results = pd.read_csv("out/results.csv")
-    assert list(results) == ["suite", "scenario", "seed", "method", "group", "measure", "value"]
+    results = read_results(Path("out/results.csv"))
+    assert list(results) == ["suite", "scenario", "seed", *RESULT_COLUMNS]
     assert set(results.suite) == {"mine"}
     chosen = results[(results.measure == "recovery") & (results.scenario == "noisy")]
-    of = chosen.set_index(["method", "seed"]).value.to_dict()
-    assert of["popl", 1] == pytest.approx(0.89)
-    assert of["other", 0] == 0.4
-    assert of["other_lexicase", 1] == 0.2
-    assert of["cpl", 0] == 0.1
+    of = chosen.set_index(["method", "choice", "seed"]).value.to_dict()
+    assert of["popl", "posterior", 1] == pytest.approx(0.89)
+    assert of["other", "posterior", 0] == 0.4
+    assert of["other", "lexicase", 1] == 0.2
+    assert of["pooled_cpl", "", 0] == 0.1
     assert len(of) == 10
     assert len(results[results.measure == "seconds"]) == 8
     report = Path("out/report.md").read_text()
@@ -400,19 +405,19 @@ def test_a_real_benchmark_in_a_worker_process(tiny, capfd):
     results = pd.read_csv("out/results.csv")
     assert set(results.method) == {
         "popl",
-        "popl_lexicase",
         "other",
-        "other_lexicase",
-        "cpl",
+        "pooled_cpl",
         "oracle",
         "random",
     }
     first, other = (cell_folder(f"plain/{name}/seed0") for name in ("popl", "other"))
     assert (first / "data").is_dir()
     assert not (other / "data").exists()
-    own = pd.read_csv(other / "results.csv").set_index(["method", "group", "measure"]).value
-    shared = pd.read_csv(first / "results.csv").set_index(["method", "group", "measure"]).value
-    for baseline in ("cpl", "oracle", "random"):
+    own, shared = (
+        read_results(folder / "results.csv").set_index(RESULT_COLUMNS[:-1]).value
+        for folder in (other, first)
+    )
+    for baseline in ("pooled_cpl", "oracle", "random"):
         pd.testing.assert_series_equal(own[baseline], shared[baseline])
     assert not own["popl"].equals(shared["popl"])
     assert not list(Path("out/logs").rglob("*.txt")), "no warnings"
