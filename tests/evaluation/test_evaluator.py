@@ -298,6 +298,24 @@ def test_the_set_as_a_whole(evaluator, baselines):
     assert values(board, "pooled_cpl", "all")["coverage"] == 0
 
 
+def test_shares_of_the_optimum_by_hand(evaluator, baselines):
+    """Walkers that hardly ever err are at the optimum; the pooled policy is random here."""
+    board = evaluator.score(walkers(30.0, -30.0), baselines)
+    for group in ("likes_left", "likes_right"):
+        for measure in ("share_of_optimum", "best_share_of_optimum", "accurate_share_of_optimum"):
+            assert board.value("popl", group, measure) == pytest.approx(1)
+        assert board.value("pooled_cpl", group, "share_of_optimum") == pytest.approx(0)
+        assert board.value("random", group, "share_of_optimum") == 0
+        assert 0.9 < board.value("oracle", group, "share_of_optimum") < 1
+    lopsided = evaluator.score(walkers(30.0), baselines)
+    for measure in ("worst_share_of_optimum", "fair_share_of_optimum"):
+        assert lopsided.value("popl", "all", measure) == pytest.approx(-1)
+    rows = board.results[board.results.measure == "worst_share_of_optimum"]
+    found = set(zip(rows.method, rows.choice, strict=True))
+    catered = {("popl", "posterior"), ("popl", "lexicase")}
+    assert found == catered | {("pooled_cpl", ""), ("oracle", ""), ("random", "")}
+
+
 def test_the_alarm_hears_a_collapse_and_no_healthy_set(evaluator, policies, baselines):
     """Two ways to serve only one group, and a set that serves both."""
     assert alarm(evaluator.score(policies, baselines).results) is None

@@ -8,7 +8,7 @@ import torch
 from omegaconf import OmegaConf
 
 from popl_rl.algorithms.vpl import EncodedPolicySet
-from popl_rl.evaluation.statistics import read_results
+from popl_rl.evaluation.statistics import RESULT_COLUMNS, read_results
 from popl_rl.experiments.builders import stream
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet
@@ -94,9 +94,9 @@ def test_a_row_for_each_generation(result):
 
 def test_results_are_tidy_and_complete(result):
     results = read_results(result.run_dir / "results.csv")
-    assert list(results) == ["method", "group", "measure", "value"]
+    assert list(results) == RESULT_COLUMNS
     pd.testing.assert_frame_equal(results, result.board.results)
-    assert not results.duplicated(["method", "group", "measure"]).any()
+    assert not results.duplicated(RESULT_COLUMNS[:-1]).any()
     for method in ("popl", "pooled_cpl", "oracle"):
         for group in ("upper", "lower"):
             for measure in ("recovery", "return", "success", "accuracy", "best_accuracy"):
@@ -175,7 +175,7 @@ def test_an_oracle_no_better_than_random_leaves_recovery_open(train):
 def test_the_published_method(train):
     result = train("method=popl_published", "method.members=8", "method.hidden=[16]")
     assert result.policies.population.evolve == "head"
-    assert math.isfinite(result.board.value("popl", "upper", "recovery"))
+    assert math.isfinite(result.board.value("popl_published", "upper", "recovery"))
 
 
 def test_teams_without_rater_ids(train, capsys):
@@ -196,8 +196,8 @@ def test_teams_without_rater_ids(train, capsys):
         ("multi_cpl", "multi_cpl", PolicySet),
         ("em", "em", PolicySet),
         ("vpl", "vpl", EncodedPolicySet),
-        ("popl_tournament", "popl", PolicySet),
-        ("popl_nsga2", "popl", PolicySet),
+        ("popl_tournament", "popl_tournament", PolicySet),
+        ("popl_nsga2", "popl_nsga2", PolicySet),
     ],
 )
 def test_methods_to_compare_with(train, method, label, found):
@@ -205,7 +205,7 @@ def test_methods_to_compare_with(train, method, label, found):
     assert type(result.policies) is found
     results = result.board.results
     assert set(results.method) == {label, "pooled_cpl", "oracle", "random"}
-    assert not results.duplicated(["method", "group", "measure"]).any()
+    assert not results.duplicated(RESULT_COLUMNS[:-1]).any()
     metrics = pd.read_csv(result.run_dir / "metrics.csv")
     assert metrics.generation.tolist() == [1, 2, 3]
     assert metrics.notna().all(axis=None)

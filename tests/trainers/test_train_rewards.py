@@ -114,7 +114,7 @@ def test_a_finished_run_is_judged_again(result, config_of, tmp_path):
 def test_other_ways_of_learning_them(train, overrides):
     result = train(*overrides)
     assert result.policies.population.evolve == "head"
-    assert math.isfinite(result.board.value("popl", "zeroed", "recovery"))
+    assert math.isfinite(result.board.value(result.board.label, "zeroed", "recovery"))
 
 
 def test_features_trained_on_everybody(train):
