@@ -14,7 +14,9 @@ from matplotlib.patches import Circle, FancyArrowPatch
 from popl_rl.evaluation.ranking_agreement import rank_shares
 from popl_rl.plotting import style as plot_style
 from popl_rl.plotting import utility_plots
-from popl_rl.plotting.utility_plots import Curves, agreement, majority_figure, utilities
+from popl_rl.plotting.agreement_plots import agreement
+from popl_rl.plotting.majority_plots import majority_figure
+from popl_rl.plotting.utility_plots import Curves, utilities
 from popl_rl.raters.condorcet import majority_preference
 
 STATES = np.linspace(0, 1, 21)
