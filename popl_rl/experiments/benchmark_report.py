@@ -41,8 +41,8 @@ _WORDS = {
     "seed. Bold: the best, where its interval is apart from those of all other methods.",
     "coverage": "share of groups with a recovery of at least 0.9.",
     "best in hindsight": "the lowest share of optimum, or recovery, if each group was given the "
-    "best of the members that were rolled out; for recovery, chosen by one half of the episodes and evaluated by the "
-    "other.",
+    "best of the members that were rolled out; for recovery, chosen by one half of the episodes "
+    "and evaluated by the other.",
     "gap": "what catering leaves to the best in hindsight, of the group with most.",
     "effective": "number of clearly different members (order 2, similarity-sensitive).",
     "fair, worst rater (10 %)": "accuracy of the one policy that a panel of new raters makes the "

@@ -87,16 +87,7 @@ def majority_figure(
         left.axvline(state, color=PALETTE["grey"], linewidth=1, linestyle=":")
         _above(left, letter, state)
         _above(middle, letter, state)
-        middle.annotate(
-            letter,
-            (1, state),
-            xycoords=("axes fraction", "data"),
-            xytext=(3, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=9,
-            weight="bold",
-        )
+        _beside(middle, letter, state)
     if found is not None:
         for one, other in zip(found, [*found[1:], found[0]], strict=True):
             x, y = np.asarray(states)[[other, one]]
@@ -151,6 +142,20 @@ def _above(ax: Axes, text: str, x: float) -> None:
         textcoords="offset points",
         ha="center",
         va="bottom",
+        fontsize=9,
+        weight="bold",
+    )
+
+
+def _beside(ax: Axes, text: str, y: float) -> None:
+    """Write a letter on the right edge of the axes."""
+    ax.annotate(
+        text,
+        (1, y),
+        xycoords=("axes fraction", "data"),
+        xytext=(3, 0),
+        textcoords="offset points",
+        va="center",
         fontsize=9,
         weight="bold",
     )

@@ -39,8 +39,8 @@ def draw_rewards(
         reward_baselines: B-REX and DPL.
 
     Returns:
-        Figures by name: ``utilities``, ``agreement`` and, with more than two groups, ``majority_preference``.
-        Empty where policies act, or a state has more than one coordinate.
+        Figures by name: ``utilities``, ``agreement`` and, with more than two groups,
+        ``majority``. Empty where policies act, or a state has more than one coordinate.
     """
     if not isinstance(evaluator.acting, Choosing) or not isinstance(rewards, RewardSet):
         return {}
