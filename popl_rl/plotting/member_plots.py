@@ -47,19 +47,9 @@ def members(
     Raises:
         ValueError: If the shapes or the group names do not fit together.
     """
-    values = np.asarray(accuracy, dtype=np.float64)
-    expected = (len(generations), len(group_names))
-    if values.ndim != 3 or (values.shape[0], values.shape[2]) != expected or expected[1] < 2:
-        raise ValueError(
-            "accuracy must be [generation, member, group] for "
-            f"{len(generations)} generations and {len(group_names)} groups (at least 2), got shape "
-            f"{values.shape}"
-        )
-    unknown = [name for name in [*catered, *(oracle or {})] if name not in group_names]
-    if unknown:
-        raise ValueError(f"catered and oracle must name groups of {group_names}, got {unknown}")
+    values = _checked(accuracy, generations, group_names, [*catered, *(oracle or {})])
     marks = [*_marks(values[-1], group_names, catered, pooled, oracle or {})]
-    points = np.concatenate([values.reshape(-1, expected[1]), *(m.point[None] for m in marks)])
+    points = np.concatenate([values.reshape(-1, len(group_names)), *(m.point[None] for m in marks)])
     low, high = np.nanmin(points), np.nanmax(points)
     low, high = low - 0.06 * max(high - low, 0.1), high + 0.16 * max(high - low, 0.1)
     pairs = list(itertools.combinations(range(len(group_names)), 2))[:6]
@@ -101,6 +91,27 @@ def members(
         handles = [shown[label] for label in labels]
         fig.legend(handles, labels, loc="outside lower left", ncols=ncols, **LEGEND)
     return fig
+
+
+def _checked(
+    accuracy: ArrayLike,
+    generations: Sequence[int],
+    group_names: Sequence[str],
+    named: Sequence[str],
+) -> NDArray[np.float64]:
+    """Return the accuracies as an array, once shapes and names fit together."""
+    values = np.asarray(accuracy, dtype=np.float64)
+    expected = (len(generations), len(group_names))
+    if values.ndim != 3 or (values.shape[0], values.shape[2]) != expected or expected[1] < 2:
+        raise ValueError(
+            "accuracy must be [generation, member, group] for "
+            f"{len(generations)} generations and {len(group_names)} groups (at least 2), got shape "
+            f"{values.shape}"
+        )
+    unknown = [name for name in named if name not in group_names]
+    if unknown:
+        raise ValueError(f"catered and oracle must name groups of {group_names}, got {unknown}")
+    return values
 
 
 def _lay_out(ax: Axes, x: str, y: str, limits: tuple[float, float]) -> None:
