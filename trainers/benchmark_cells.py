@@ -46,7 +46,7 @@ def make_tasks(cells: Sequence[Cell], run_dir: Path) -> list[Task]:
         if cell.overrides in configs:
             continue
         try:
-            configs[cell.overrides] = _compose([*cell.overrides, *_ALWAYS])
+            configs[cell.overrides] = compose_train([*cell.overrides, *_ALWAYS])
             validate(configs[cell.overrides])
         except USER_ERRORS as error:
             raise ValueError(f"cell {cell.name} cannot be run: {error}") from error
@@ -82,7 +82,8 @@ def run_task(task: Task) -> str | None:
     return problem
 
 
-def _compose(overrides: Sequence[str]) -> Any:
+def compose_train(overrides: Sequence[str]) -> Any:
+    """Compose the configuration of ``popl-train`` from overrides, also inside of a Hydra job."""
     if GlobalHydra.instance().is_initialized():  # inside of a Hydra job
         return compose("train", overrides=list(overrides))
     with initialize_config_module("popl_rl.configs", version_base="1.3"):

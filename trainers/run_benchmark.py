@@ -22,8 +22,11 @@ from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
+from popl_rl.evaluation.method_names import drawn_references
+from popl_rl.evaluation.statistics import HEADLINES, headline_measure
 from popl_rl.evaluation.suite import Suite
-from popl_rl.experiments.benchmark_report import recovery_table, write_report
+from popl_rl.experiments.benchmark_report import write_report
+from popl_rl.experiments.benchmark_tables import recovery_table
 from popl_rl.experiments.cells import Cell, claim, collect, is_finished, plan
 from popl_rl.experiments.jobs import Job, run_jobs
 from popl_rl.experiments.run_folder import Progress
@@ -101,11 +104,13 @@ def show(result: Result) -> None:
     console = Console()
     suite = result.suite
     (_, *methods), rows = recovery_table(suite, result.results)
-    shown = [suite.label(name) for name in (*suite.methods, "cpl", "bradley_terry")]
+    shown = [suite.label(name) for name in (*suite.methods, *drawn_references())]
     table = Table(
         "scenario",
         "method",
-        Column("recovery ± 95 % [lowest seed]", justify="right"),
+        Column(
+            f"{HEADLINES[headline_measure(result.results)]} ± 95 % [lowest seed]", justify="right"
+        ),
         title="How well is the worst-served group served?",
     )
     for scenario, *cells in rows:

@@ -13,9 +13,9 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
-from popl_rl.evaluation.statistics import summary
+from popl_rl.evaluation.method_names import method_name
+from popl_rl.evaluation.statistics import HEADLINES, headline_measure, read_results, summary
 from popl_rl.experiments.report import results_table
-from popl_rl.plotting.run_plots import method_name
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -31,16 +31,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
             soft_wrap=True,
         )
         return 2
-    runs = {str(folder): pd.read_csv(folder / "results.csv") for folder in folders}
+    runs = {str(folder): read_results(folder / "results.csv") for folder in folders}
     console = Console()
-    console.print(results_table(pd.concat(runs.values())))
+    together = pd.concat(runs.values())
+    console.print(results_table(together))
+    measure = headline_measure(together)
     table = Table(title=f"The group served worst, over {len(runs)} runs (mean ± 95 % interval)")
-    for name in ("method", "worst group's recovery", "lowest run", "accuracy behind the oracle"):
+    worst = f"worst group's {HEADLINES[measure]}"
+    for name in ("method", worst, "lowest run", "accuracy behind the oracle"):
         table.add_column(name, justify="left" if name == "method" else "right")
-    for row in summary(runs).itertuples():
-        recovery = f"{row.worst_recovery:.2f} ± {row.worst_recovery_ci:.2f}"
-        lowest, gap = f"{row.worst_recovery_min:.2f}", f"at most {row.accuracy_gap:.3f}"
-        table.add_row(method_name(str(row.method)), recovery, lowest, gap)
+    for row in summary(runs, measure=measure).to_dict("records"):
+        mean, half, low = (row[f"worst_{measure}{what}"] for what in ("", "_ci", "_min"))
+        gap = f"at most {row['accuracy_gap']:.3f}"
+        name = method_name(row["method"], row["choice"])
+        table.add_row(name, f"{mean:.2f} ± {half:.2f}", f"{low:.2f}", gap)
     console.print(table)
     return 0
 

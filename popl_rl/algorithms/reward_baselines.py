@@ -33,12 +33,12 @@ class RewardBaselines:
     brex: RewardSet
     dpl: dict[str, DistributionalReward]
 
-    def scores(self, bank: SegmentBank) -> dict[str, Tensor]:
-        """Scores ``[N]`` of DPL's kinds, by expectation and risk-averse, by name of the method."""
+    def scores(self, bank: SegmentBank) -> dict[tuple[str, str], Tensor]:
+        """Scores ``[N]`` of DPL's kinds, by name of the method and what a choice goes by."""
         return {
-            f"dpl_{kind}{suffix}": model.scores(bank, risk=risk)
+            (f"dpl_{kind}", choice): model.scores(bank, risk=risk)
             for kind, model in self.dpl.items()
-            for suffix, risk in (("", None), ("_risk_averse", _RISK[kind]))
+            for choice, risk in (("expectation", None), ("risk_averse", _RISK[kind]))
         }
 
 

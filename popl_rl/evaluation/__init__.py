@@ -1,1 +1,10 @@
-"""evaluation."""
+"""Evaluation of what was learnt, by what every hidden group of raters wants.
+
+- What hypotheses do: ``acting`` rolls policies out, plans for reward functions or chooses items;
+  ``ppo`` trains policies on reward functions.
+- What that is worth: ``measures`` of episodes and rankings, ``optimum`` with exact returns,
+  ``best_of_set``, ``held_out_raters`` and ``ranking_agreement``.
+- What is told: ``evaluator`` fills the ``results`` of a run, ``diagnostics`` puts into words what
+  stands out, ``statistics`` summarises groups and seeds, ``method_names`` says what methods are
+  called, and ``suite`` what a benchmark compares.
+"""

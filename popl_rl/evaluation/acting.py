@@ -52,14 +52,26 @@ class Rolling:
 
     def __call__(self, hypotheses: HypothesisSet | None) -> TensorDict:
         """See :class:`Acting`."""
-        if hypotheses is None:
-            return self._roll(None)
-        if not isinstance(hypotheses, PolicySet):
+        return self._roll(self.policies(hypotheses))
+
+    def policies(self, hypotheses: HypothesisSet | None) -> PolicySet | Tensor | None:
+        """The policies by which hypotheses act.
+
+        Args:
+            hypotheses: P hypotheses; None for random actions.
+
+        Returns:
+            P policies, or tables ``[P, S, A]`` of action probabilities; None for random actions.
+
+        Raises:
+            TypeError: If the hypotheses do not act for themselves.
+        """
+        if hypotheses is not None and not isinstance(hypotheses, PolicySet):
             raise TypeError(
                 f"hypotheses must be a PolicySet, got a {type(hypotheses).__name__}; reward "
                 "functions act by planning or after PPO"
             )
-        return self._roll(hypotheses)
+        return hypotheses
 
     def _roll(self, policies: PolicySet | Tensor | None) -> TensorDict:
         return roll_out(
@@ -79,16 +91,16 @@ class Planning(Rolling):
     Needs an environment with a transition table.
     """
 
-    def __call__(self, hypotheses: HypothesisSet | None) -> TensorDict:
-        """See :class:`Acting`."""
+    def policies(self, hypotheses: HypothesisSet | None) -> PolicySet | Tensor | None:
+        """See :meth:`Rolling.policies`."""
         if not isinstance(hypotheses, RewardSet):
-            return super().__call__(hypotheses)
+            return super().policies(hypotheses)
         if self.world.table is None:
             raise ValueError(
                 "the environment exposes no transition table to plan with; set "
                 "evaluation.optimiser=ppo"
             )
-        return self._roll(plan(hypotheses, self.world.table))
+        return plan(hypotheses, self.world.table)
 
 
 class Optimising(Rolling):
@@ -118,13 +130,13 @@ class Optimising(Rolling):
         self.progress = progress
         self._trained: dict[bytes, Population] = {}
 
-    def __call__(self, hypotheses: HypothesisSet | None) -> TensorDict:
-        """See :class:`Acting`."""
+    def policies(self, hypotheses: HypothesisSet | None) -> PolicySet | Tensor | None:
+        """See :meth:`Rolling.policies`."""
         if not isinstance(hypotheses, RewardSet):
-            return super().__call__(hypotheses)
+            return super().policies(hypotheses)
         trained = [self._policy(hypotheses, member) for member in range(len(hypotheses))]
         networks = [population.network(0) for population in trained]
-        return self._roll(PolicySet(Population(networks, trained[0].spec)))
+        return PolicySet(Population(networks, trained[0].spec))
 
     def _policy(self, rewards: RewardSet, member: int) -> Population:
         own = rewards.population.members.data[member].values(True, True)

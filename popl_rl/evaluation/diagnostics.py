@@ -9,8 +9,9 @@ from popl_rl.evaluation.results import Scoreboard
 from popl_rl.keys import OBSERVATION
 from popl_rl.raters.condorcet import find_cycle, majority_preference
 
-__all__ = ["alarm", "diagnostics"]
+__all__ = ["alarm", "diagnostics", "weak_oracles"]
 
+_WEAK = 0.8  # share of the optimum below which an oracle is no measure of others
 _ITEMS = 150  # of which three are looked for that a majority prefers in a circle
 
 
@@ -23,9 +24,10 @@ def diagnostics(board: Scoreboard, evaluator: Evaluator) -> dict[str, str]:
 
     Returns:
         Sentences by what they are about: ``new raters' further answers``, how well they are met;
-        ``alarm``, see :func:`alarm`; ``collapse``, if groups were given the same hypothesis;
-        ``hidden context``, DPL's detector, if it ran; ``majority_preference``, if the groups, pooled in equal
-        shares, prefer states in a circle, so that no single utility can say what they want.
+        ``alarm``, see :func:`alarm`; ``oracle``, if one is far from the optimum of its group;
+        ``collapse``, if groups were given the same hypothesis; ``hidden context``, DPL's detector,
+        if it ran; ``majority``, if the groups, pooled in equal shares, prefer states in a circle,
+        so that no single utility can say what they want.
     """
     said = {}
     row = _row_of(board.results)
@@ -37,6 +39,9 @@ def diagnostics(board: Scoreboard, evaluator: Evaluator) -> dict[str, str]:
     warning = alarm(board.results)
     if warning is not None:
         said["alarm"] = warning
+    weak = weak_oracles(board.results)
+    if weak is not None:
+        said["oracle"] = weak
     shared: dict[int, list[str]] = {}
     for name, member in board.catered.items():
         shared.setdefault(member, []).append(name)
@@ -80,12 +85,33 @@ def alarm(results: pd.DataFrame) -> str | None:
     )
 
 
+def weak_oracles(results: pd.DataFrame) -> str | None:
+    """Say so if oracles are far from the optimum, so that recovery flatters what is compared.
+
+    Args:
+        results: Rows of a scoreboard.
+
+    Returns:
+        A sentence, or None if every oracle has 0.8 of the optimum or nothing is known of it.
+    """
+    shares = results[(results.method == "oracle") & (results.measure == "share_of_optimum")]
+    weak = shares[shares.value < _WEAK]
+    if weak.empty:
+        return None
+    each = ", ".join(f"{row.value:.2f} for {row.group}" for row in weak.itertuples())
+    return (
+        f"has a share of the optimum of only {each}: a recovery of 1 is little there; give all "
+        "methods more answers or training, and read the share of the optimum instead"
+    )
+
+
 def _row_of(results: pd.DataFrame) -> pd.Series | None:
     """What was measured about the set as a whole, by measure."""
     evaluated = results.method[results.measure == "gain"]
     if evaluated.empty:
         return None
-    chosen = (results.method == evaluated.iloc[0]) & (results.group == "all")
+    whole = (results.group == "all") & (results.choice == "")
+    chosen = whole & (results.method == evaluated.iloc[0])
     row: pd.Series = results[chosen].set_index("measure")["value"]
     return row
 

@@ -1,22 +1,28 @@
 """The scoreboard of a run: every method, every group, every measure, in tidy rows.
 
-For each group: ``return, recovery, success, accuracy, best_accuracy`` of what new raters are given
-after ``evaluation.answers`` answers; ``accuracy@K`` and ``recovery@K`` after K; ``best_recovery``
-of the best of the members rolled out, without the luck of the best; ``accurate_recovery`` of the
-member that ranks the group's held-out pairs best (and both returns).
+Rows are ``method, choice, group, measure, value``. The choice is how a member was chosen from a
+set: ``posterior`` or ``lexicase`` catering, ``expectation`` or ``risk_averse``; it is empty where
+there is one hypothesis only, and for measures of a set as a whole.
 
-For the group ``all``: ``worst_recovery`` and ``coverage`` of the groups. For a set also
-``distinct`` and ``effective`` members; how held_out of new raters, whose groups nobody looks at, are
-met (``further_accuracy, one_for_all_accuracy, gain, gain_error, favourite_share``, see
-:mod:`popl_rl.evaluation.held_out_raters`); accuracy of the fair choice of one panel for the worst rater of another
-(``fair_worst_rater``) and the 10 % quantile (``fair_quantile``), and its ``fair_recovery`` for the
-group that it serves worst.
+For each group and choice: ``return, recovery, success, accuracy, best_accuracy`` of what new raters
+are given after ``evaluation.answers`` answers; ``accuracy@K`` and ``recovery@K`` after K answers.
+Of a set as a whole, ``best_return`` and ``best_recovery`` of the best of the members rolled out,
+without the luck of the best, and ``accurate_return`` and ``accurate_recovery`` of the member that
+ranks the group's held-out pairs best. Where the environment has a transition table, each of these
+recoveries has a ``share_of_optimum`` beside it, from exact returns instead of rollouts.
+
+For the group ``all``: ``worst_recovery, worst_share_of_optimum`` and ``coverage`` of the groups.
+For a set also the number of ``distinct`` and ``effective`` members; how well it meets held-out
+raters whose groups nobody looks at (``further_accuracy, one_for_all_accuracy, gain, gain_error,
+favourite_share``, see :mod:`popl_rl.evaluation.held_out_raters`); and of the fair choice of one
+panel of held-out raters, its accuracy for the worst rater of another panel (``fair_worst_rater``)
+and the 10 % quantile (``fair_quantile``), and its recovery for the group that it serves worst
+(``fair_recovery``).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 
-import pandas as pd
 import torch
 from tensordict import TensorDict
 from torch import Tensor
@@ -25,7 +31,7 @@ from popl_rl.algorithms.reward_baselines import RewardBaselines
 from popl_rl.config import EnvConfig, EvaluationConfig
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
-from popl_rl.evaluation.acting import Acting, Choosing, Optimising
+from popl_rl.evaluation.acting import Acting, Choosing, Optimising, Rolling
 from popl_rl.evaluation.best_of_set import best_of_set, lowest, to_roll
 from popl_rl.evaluation.held_out_raters import draw_held_out_raters, favourites, gain
 from popl_rl.evaluation.measures import (
@@ -34,7 +40,8 @@ from popl_rl.evaluation.measures import (
     held_out_pairs,
     new_rater_answers,
 )
-from popl_rl.evaluation.results import Rows, Scoreboard, Served
+from popl_rl.evaluation.optimum import ExactReturns
+from popl_rl.evaluation.results import Performance, Rows, Scoreboard, Served
 from popl_rl.keys import RATER
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.policy_set import PolicySet
@@ -45,21 +52,21 @@ from popl_rl.raters.pairs import PairPool
 
 __all__ = ["Evaluator"]
 
-_CATERING = {"posterior": "", "lexicase": "_lexicase"}  # what it adds to a method's name
+_CATERING = ("posterior", "lexicase")  # kinds of catering, the headline first
 _PANEL = 5  # raters of each of two panels, for each new rater of a group
 _PANEL_ANSWERS = 50
 
 
 class Evaluator:
-    """Judges hypotheses by what every hidden group wants; reads what no learner may.
+    """Evaluates hypotheses by what every hidden group wants; reads what no learner may.
 
     Args:
         acting: Shows what hypotheses do.
         env: Which infos mean success and doors.
         config: How many answers, raters and pairs.
         groups: G groups.
-        bank: Segments to judge on.
-        segment_utility: Worth of each segment to each group, ``[G, N]``.
+        bank: N segments to evaluate on.
+        segment_utility: Utility of each segment to each group, ``[G, N]``.
         pool: Pairs to evaluate on; all pairs of the N segments if None.
         clone: A clone of the data's typical behaviour, for comparison; None for none.
         shares: Chance that a rater is of each group; equal if None.
@@ -91,6 +98,12 @@ class Evaluator:
             )
             for index in range(len(groups))
         }
+        self._exact: ExactReturns | None = None
+        self._policies = acting.policies if isinstance(acting, Rolling) else None
+        if isinstance(acting, Rolling) and acting.world.table is not None:
+            self._exact = ExactReturns(
+                acting.world.table, groups, horizon=env.max_steps, greedy=config.greedy
+            )
 
     def scores(self, hypotheses: HypothesisSet) -> Tensor:
         """Score of every segment in every hypothesis's eyes, ``[P, N]``."""
@@ -192,73 +205,65 @@ class Evaluator:
             hypotheses: The set that was found.
             baselines: One trained on everybody's answers, then one oracle per group; None to leave
                 them, and with them ``recovery``, out.
-            reward_baselines: Other learners of reward functions, for :class:`~popl_rl.evaluation.acting.Choosing` alone.
+            reward_baselines: Other learners of reward functions, for
+                :class:`~popl_rl.evaluation.acting.Choosing` alone.
             label: Name of the method that found ``hypotheses``.
         """
-        random = self.acting(None)
-        base = None if baselines is None else self.acting(baselines)
-        cloned = None if self.clone is None else self.acting(self.clone)
-        # What each oracle, in the rows, is worth to each group.
-        segment_utility = None if base is None else group_returns(base[1:], self.groups)
-        rows = self._rows(random, cloned, segment_utility)
+        random = self._perform(None)
+        base = None if baselines is None else self._perform(baselines)
+        cloned = None if self.clone is None else self._perform(self.clone)
+        rows = self._rows(random, cloned, base)
+        pooled_scores = None if baselines is None else self.scores(baselines)[0]
+        # Curves of what is evaluated; what it is compared with has too many members for them.
+        curve = sorted(set(self.config.curve))
+        served = self._serve(hypotheses, label, rows, curve=curve)
+        self._score_as_a_whole(hypotheses, label, rows, served, pooled_scores)
         catered: dict[str, int] = {}
         episodes: dict[tuple[str, str], TensorDict] = {}
-        sets = {label: hypotheses} | (
-            {} if reward_baselines is None else {"brex": reward_baselines.brex}
-        )
-        pooled_scores = None if baselines is None else self.scores(baselines)[0]
-        for whose, found in sets.items():
-            # Curves of what is judged; what it is compared with has too many members for them.
-            curve = sorted(set(self.config.curve)) if found is hypotheses else []
-            served = self._serve(found, whose, rows, curve=curve)
-            self._score_as_a_whole(found, whose, rows, served, pooled_scores)
-            if found is hypotheses:
-                for index, group in enumerate(self.groups):
-                    place = int(served.share(index, served.picks["posterior"]).argmax())
-                    catered[group.name] = served.members[place]
-                    episodes[label, group.name] = served.rolled[place : place + 1]
+        for index, group in enumerate(self.groups):
+            place = int(served.share(index, served.picks["posterior"]).argmax())
+            catered[group.name] = served.members[place]
+            episodes[label, group.name] = served.performance.one(place).episodes
+        if reward_baselines is not None:
+            brex = self._serve(reward_baselines.brex, "brex", rows, curve=[])
+            self._score_as_a_whole(reward_baselines.brex, "brex", rows, brex, pooled_scores)
         if baselines is not None and base is not None:
-            accuracy, one = self.accuracy(baselines), torch.ones(1)
-            pooled = "cpl" if isinstance(baselines, PolicySet) else "bradley_terry"
-            for index, group in enumerate(self.groups):
-                for name, row in ((pooled, 0), ("oracle", 1 + index)):
-                    rows.add(name, index, base[row : row + 1], one)
-                    value = float(accuracy[row, index])
-                    rows.add_accuracy(name, index, value, value)
-                    episodes[name, group.name] = base[row : row + 1]
+            episodes |= self._score_baselines(baselines, base, rows)
         if reward_baselines is not None:
             self._score_distributional(reward_baselines, rows)
         for index in range(len(self.groups)):
             if cloned is not None:
-                rows.add("clone", index, cloned, torch.ones(1))
-            rows.add("random", index, random, torch.ones(1))
+                rows.add(("clone", ""), index, cloned, torch.ones(1))
+            rows.add(("random", ""), index, random, torch.ones(1))
         rows.add_worst()
-        results = pd.DataFrame(rows.rows, columns=["method", "group", "measure", "value"])
-        return Scoreboard(results, catered, episodes, label)
+        return Scoreboard(rows.table(), catered, episodes, label)
+
+    def _perform(self, hypotheses: HypothesisSet | None) -> Performance:
+        """Episodes of every hypothesis, and exact returns where every transition is known."""
+        exact = None
+        if self._exact is not None and self._policies is not None:
+            exact = self._exact(self._policies(hypotheses))
+        return Performance(self.acting(hypotheses), exact)
 
     def _rows(
-        self, random: TensorDict, cloned: TensorDict | None, segment_utility: Tensor | None
+        self, random: Performance, cloned: Performance | None, base: Performance | None
     ) -> Rows:
         """Rows to fill, which know the returns that are a recovery of 0 and of 1."""
-        if self.config.reference == "others" and segment_utility is not None:
-            alien = segment_utility.masked_fill(
-                torch.eye(len(segment_utility), dtype=torch.bool), torch.inf
-            )
-            floor = alien.amin(0)
+        # Return of each oracle, in the rows, to each group.
+        returns = None if base is None else group_returns(base.episodes[1:], self.groups)
+        if self.config.reference == "others" and returns is not None:
+            own = torch.eye(len(returns), dtype=torch.bool)
+            floor = returns.masked_fill(own, torch.inf).amin(0)
         elif self.config.reference == "clone" and cloned is not None:
-            floor = group_returns(cloned, self.groups)[0]
+            floor = group_returns(cloned.episodes, self.groups)[0]
         else:
-            floor = group_returns(random, self.groups)[0]
-        oracle = (
-            torch.full_like(floor, torch.nan)
-            if segment_utility is None
-            else segment_utility.diagonal()
-        )
-        return Rows(self.groups, self.env, floor=floor, oracle=oracle)
+            floor = group_returns(random.episodes, self.groups)[0]
+        oracle = torch.full_like(floor, torch.nan) if returns is None else returns.diagonal()
+        return Rows(self.groups, self.env, floor=floor, oracle=oracle, exact=self._exact)
 
     def _serve(
-        self, found: HypothesisSet, label: str, rows: "Rows", *, curve: Sequence[int]
-    ) -> "Served":
+        self, found: HypothesisSet, label: str, rows: Rows, *, curve: Sequence[int]
+    ) -> Served:
         """What new raters are given, and what it is worth to them beside the best there is."""
         accuracy = self.accuracy(found)
         picks = {method: self.cater(found, method) for method in _CATERING}
@@ -273,36 +278,66 @@ class Evaluator:
         # A member more costs a training of PPO more, where that is how members act.
         limit = 0 if isinstance(self.acting, Optimising) else self.config.curve_members
         members = to_roll(always, points, limit=limit)
-        rolled = self.acting(found.subset(members))
-        served = Served(picks, members, rolled, int(fair))
-        returns = group_returns(rolled, self.groups)
-        halves = rolled[:, ::2], rolled[:, 1::2] if rolled.shape[1] > 1 else rolled
-        best = best_of_set(*(group_returns(half, self.groups) for half in halves))
+        done = self._perform(found.subset(members))
+        served = Served(picks, members, done, int(fair))
         for index in range(len(self.groups)):
             most = float(accuracy[:, index].max())
             for method, chosen in picks.items():
-                name = label + _CATERING[method]
-                rows.add(name, index, rolled, served.share(index, chosen))
-                rows.add_accuracy(name, index, float(accuracy[chosen[index], index].mean()), most)
-            rows.add_return(label, index, "best_", float(best[index]))
-            place = members.index(int(accurate[index]))
-            rows.add_return(label, index, "accurate_", float(returns[place, index]))
-            for (method, answers), chosen in points.items():
-                name = label + _CATERING[method]
-                value = float(accuracy[chosen[index], index].mean())
-                rows.add_value(name, index, f"accuracy@{answers}", value)
-                if set(chosen.flatten().tolist()) <= set(members):
-                    value = float(returns[:, index] @ served.share(index, chosen))
-                    value = rows.recovery(index, value)
-                    rows.add_value(name, index, f"recovery@{answers}", value)
+                entry = label, method
+                rows.add(entry, index, done, served.share(index, chosen))
+                given = float(accuracy[chosen[index], index].mean())
+                rows.add_accuracy(entry, index, catered=given, best=most)
+        self._score_hindsight(label, rows, done, [members.index(int(one)) for one in accurate])
+        self._score_curves(label, rows, served, points, accuracy)
         return served
+
+    def _score_hindsight(
+        self, label: str, rows: Rows, done: Performance, accurate: Sequence[int]
+    ) -> None:
+        """What each group would get of its best member, and of its most accurate one."""
+        rolled, entry = done.episodes, (label, "")
+        returns = group_returns(rolled, self.groups)
+        halves = rolled[:, ::2], rolled[:, 1::2] if rolled.shape[1] > 1 else rolled
+        best = best_of_set(*(group_returns(half, self.groups) for half in halves))
+        for index, place in enumerate(accurate):
+            rows.add_return(entry, index, float(best[index]), prefix="best_")
+            rows.add_return(entry, index, float(returns[place, index]), prefix="accurate_")
+            if done.exact is not None:
+                own = done.exact[:, index]
+                rows.add_share(entry, index, float(own.max()), prefix="best_")
+                rows.add_share(entry, index, float(own[place]), prefix="accurate_")
+
+    def _score_curves(
+        self,
+        label: str,
+        rows: Rows,
+        served: Served,
+        points: Mapping[tuple[str, int], Tensor],
+        accuracy: Tensor,
+    ) -> None:
+        """What new raters are given after other numbers of answers."""
+        done = served.performance
+        returns = group_returns(done.episodes, self.groups)
+        for index in range(len(self.groups)):
+            for (method, answers), chosen in points.items():
+                entry = label, method
+                value = float(accuracy[chosen[index], index].mean())
+                rows.add_value(entry, index, f"accuracy@{answers}", value)
+                if not set(chosen.flatten().tolist()) <= set(served.members):
+                    continue
+                share = served.share(index, chosen)
+                value = rows.recovery(index, float(returns[:, index] @ share))
+                rows.add_value(entry, index, f"recovery@{answers}", value)
+                if done.exact is not None:
+                    value = float(done.exact[:, index] @ share.double())
+                    rows.add_share(entry, index, value, suffix=f"@{answers}")
 
     def _score_as_a_whole(
         self,
         found: HypothesisSet,
         label: str,
-        rows: "Rows",
-        served: "Served",
+        rows: Rows,
+        served: Served,
         pooled: Tensor | None,
     ) -> None:
         """What a set is worth to raters whose group nobody knows: rows of the group ``all``."""
@@ -318,30 +353,49 @@ class Evaluator:
         favourite = favourites(margin, everybody)
         fair = scores[served.fair].unsqueeze(0)
         fair = case_values(fair[:, judging.preferred] > fair[:, judging.other], judging)[0]
-        place = served.members.index(served.fair)
-        returns = group_returns(served.rolled[place : place + 1], self.groups)[0].tolist()
-        recoveries = [rows.recovery(index, value) for index, value in enumerate(returns)]
-        rows.rows += [
-            (label, "all", "distinct", float(len((margin > 0).unique(dim=0)))),
-            (label, "all", "effective", found.effective_number(self.bank, everybody)),
-            (label, "all", "favourite_share", float(favourite.bincount().max() / len(favourite))),
-            (label, "all", "further_accuracy", met.catered),
-            (label, "all", "one_for_all_accuracy", met.alone),
-            (label, "all", "gain", met.catered - met.alone),
-            (label, "all", "gain_error", met.error),
-            (label, "all", "fair_worst_rater", float(fair.min())),
-            (label, "all", "fair_quantile", float(fair.quantile(0.1))),
-            (label, "all", "fair_recovery", lowest(recoveries)),
-        ]
+        chosen = served.performance.one(served.members.index(served.fair))
+        returns = group_returns(chosen.episodes, self.groups)[0].tolist()
+        values = {
+            "distinct": float(len((margin > 0).unique(dim=0))),
+            "effective": found.effective_number(self.bank, everybody),
+            "favourite_share": float(favourite.bincount().max() / len(favourite)),
+            "further_accuracy": met.catered,
+            "one_for_all_accuracy": met.alone,
+            "gain": met.catered - met.alone,
+            "gain_error": met.error,
+            "fair_worst_rater": float(fair.min()),
+            "fair_quantile": float(fair.quantile(0.1)),
+            "fair_recovery": lowest([rows.recovery(i, value) for i, value in enumerate(returns)]),
+        }
+        if self._exact is not None and chosen.exact is not None:
+            exact = chosen.exact[0].tolist()
+            shares = [self._exact.share_of_optimum(i, value) for i, value in enumerate(exact)]
+            values["fair_share_of_optimum"] = lowest(shares)
+        for measure, value in values.items():
+            rows.add_whole((label, ""), measure, value)
 
-    def _score_distributional(self, reward_baselines: RewardBaselines, rows: "Rows") -> None:
+    def _score_baselines(
+        self, baselines: HypothesisSet, base: Performance, rows: Rows
+    ) -> dict[tuple[str, str], TensorDict]:
+        """Rows of the pooled hypothesis and of each group's oracle; returns their episodes."""
+        accuracy, one, episodes = self.accuracy(baselines), torch.ones(1), {}
+        pooled = "pooled_cpl" if isinstance(baselines, PolicySet) else "bradley_terry"
+        for index, group in enumerate(self.groups):
+            for name, row in ((pooled, 0), ("oracle", 1 + index)):
+                rows.add((name, ""), index, base.one(row), one)
+                value = float(accuracy[row, index])
+                rows.add_accuracy((name, ""), index, catered=value, best=value)
+                episodes[name, group.name] = base.one(row).episodes
+        return episodes
+
+    def _score_distributional(self, reward_baselines: RewardBaselines, rows: Rows) -> None:
         assert isinstance(self.acting, Choosing)
-        for label, score in reward_baselines.scores(self.bank).items():
-            chosen = self.acting.choose(score.cpu().unsqueeze(0))
+        for entry, score in reward_baselines.scores(self.bank).items():
+            chosen = Performance(self.acting.choose(score.cpu().unsqueeze(0)), None)
             accuracy = group_accuracy(score.cpu().unsqueeze(0), self.pairs)[0].tolist()
             for index, value in enumerate(accuracy):
-                rows.add(label, index, chosen, torch.ones(1))
-                rows.add_accuracy(label, index, value, value)
+                rows.add(entry, index, chosen, torch.ones(1))
+                rows.add_accuracy(entry, index, catered=value, best=value)
         for kind, model in reward_baselines.dpl.items():
             context = model.hidden_context(self.bank)
-            rows.rows.append((f"dpl_{kind}", "all", "hidden_context", context))
+            rows.add_whole((f"dpl_{kind}", ""), "hidden_context", context)

@@ -18,9 +18,11 @@ from popl_rl.evaluation.measures import (
     steps_to_success,
     success_rate,
 )
+from popl_rl.evaluation.optimum import ExactReturns
+from popl_rl.evaluation.statistics import RESULT_COLUMNS
 from popl_rl.raters.groups import RaterGroup
 
-__all__ = ["Rows", "Scoreboard", "Served"]
+__all__ = ["Performance", "Rows", "Scoreboard", "Served"]
 
 
 @dataclass(frozen=True)
@@ -28,10 +30,10 @@ class Scoreboard:
     """What came out.
 
     Attributes:
-        results: Tidy rows ``method, group, measure, value``.
+        results: Tidy rows ``method, choice, group, measure, value``.
         catered: Member that a first new rater of each group was given, by group name.
         episodes: Episodes ``[1, E, H]`` behind the pictures, by method and group name.
-        label: Name of the method whose set was judged.
+        label: Name of the method whose set was evaluated.
     """
 
     results: pd.DataFrame
@@ -39,11 +41,43 @@ class Scoreboard:
     episodes: dict[tuple[str, str], TensorDict]
     label: str = "popl"
 
-    def value(self, method: str, group: str, measure: str) -> float:
-        """One number of the table."""
+    def value(self, method: str, group: str, measure: str, choice: str | None = None) -> float:
+        """One number of the table.
+
+        Args:
+            method: Value of the column ``method``.
+            group: Name of a group, or ``all``.
+            measure: What was measured.
+            choice: How the hypothesis was chosen; the method's first choice if None.
+
+        Raises:
+            KeyError: If there is no such row.
+        """
         rows = self.results
         chosen = rows[(rows.method == method) & (rows.group == group) & (rows.measure == measure)]
+        if choice is not None:
+            chosen = chosen[chosen.choice == choice]
+        if chosen.empty:
+            raise KeyError(f"no row has {method=}, {group=}, {measure=} and {choice=}")
         return float(chosen.value.iloc[0])
+
+
+@dataclass(frozen=True)
+class Performance:
+    """What P hypotheses do.
+
+    Attributes:
+        episodes: ``[P, E, H]``.
+        exact: Exact return of each to each group, ``[P, G]``; None without a transition table.
+    """
+
+    episodes: TensorDict
+    exact: Tensor | None
+
+    def one(self, index: int) -> "Performance":
+        """The performance of one hypothesis alone."""
+        rows = slice(index, index + 1)
+        return Performance(self.episodes[rows], None if self.exact is None else self.exact[rows])
 
 
 @dataclass(frozen=True)
@@ -53,13 +87,13 @@ class Served:
     Attributes:
         picks: Member of each new rater ``[G, raters]``, by kind of catering.
         members: Members that were rolled out.
-        rolled: Their episodes, ``[len(members), E, H]``.
+        performance: What these do.
         fair: The fair choice.
     """
 
     picks: dict[str, Tensor]
     members: list[int]
-    rolled: TensorDict
+    performance: Performance
     fair: int
 
     def share(self, index: int, picks: Tensor) -> Tensor:
@@ -69,67 +103,109 @@ class Served:
 
 
 class Rows:
-    """Tidy rows in the making.
+    """Tidy rows ``method, choice, group, measure, value`` in the making.
 
     Args:
         groups: G groups.
         env: Which infos mean success and doors, and which are measured.
         floor: Return to each group that is a recovery of 0, ``[G]``.
         oracle: Return of each group's oracle, ``[G]``; NaN where it is unknown.
+        exact: Knows the optimum of each group; None without a transition table.
     """
 
     def __init__(
-        self, groups: Sequence[RaterGroup], env: EnvConfig, *, floor: Tensor, oracle: Tensor
+        self,
+        groups: Sequence[RaterGroup],
+        env: EnvConfig,
+        *,
+        floor: Tensor,
+        oracle: Tensor,
+        exact: ExactReturns | None = None,
     ) -> None:
         self.groups, self.env = groups, env
-        self.floor, self.oracle = floor, oracle
-        self.rows: list[tuple[str, str, str, float]] = []
+        self.floor, self.oracle, self.exact = floor, oracle, exact
+        self.rows: list[tuple[str, str, str, str, float]] = []
 
-    def add(self, method: str, index: int, rolled: TensorDict, share: Tensor) -> None:
-        """What a method does for one group: policies ``[P, E, H]``, weighted by ``share``."""
-        group = self.groups[index].name
+    def add(self, entry: tuple[str, str], index: int, done: Performance, share: Tensor) -> None:
+        """What a method does for one group.
+
+        Args:
+            entry: Method and choice.
+            index: Index of the group.
+            done: What P hypotheses do.
+            share: How much each of them counts, ``[P]``.
+        """
+        rolled = done.episodes
         value = float(group_returns(rolled, self.groups)[:, index] @ share)
-        self.add_return(method, index, "", value)
+        self.add_return(entry, index, value)
+        if done.exact is not None:
+            self.add_share(entry, index, float(done.exact[:, index] @ share.double()))
         success = float(success_rate(rolled, self.env.success) @ share)
-        self.rows.append((method, group, "success", success))
+        self.add_value(entry, index, "success", success)
         if self.env.measured:
             steps = float(steps_to_success(rolled, self.env.success) @ share)
-            self.rows.append((method, group, "steps", steps))
+            self.add_value(entry, index, "steps", steps)
         for name in self.env.measured:
             for what, values in zip(("mean", "peak"), mean_and_peak(rolled, name), strict=True):
-                self.rows.append((method, group, f"{what}_{name}", float(values @ share)))
+                self.add_value(entry, index, f"{what}_{name}", float(values @ share))
         if self.env.door is not None:
             for door, rate in info_rates(rolled, self.env.door).items():
                 if door >= 0:
-                    name = f"{self.env.door}_{door}"
-                    self.rows.append((method, group, name, float(rate @ share)))
+                    self.add_value(entry, index, f"{self.env.door}_{door}", float(rate @ share))
 
     def recovery(self, index: int, value: float) -> float:
         """What a return to a group is between the floor and the group's oracle."""
         low, high = float(self.floor[index]), float(self.oracle[index])
         return recovery(value, reference=low, oracle=high)
 
-    def add_return(self, method: str, index: int, prefix: str, value: float) -> None:
-        """A return to one group, and the recovery that this is."""
-        self.add_value(method, index, f"{prefix}return", value)
-        self.add_value(method, index, f"{prefix}recovery", self.recovery(index, value))
+    def add_return(
+        self, entry: tuple[str, str], index: int, value: float, *, prefix: str = ""
+    ) -> None:
+        """A mean return of episodes to one group, and the recovery that this is."""
+        self.add_value(entry, index, f"{prefix}return", value)
+        self.add_value(entry, index, f"{prefix}recovery", self.recovery(index, value))
 
-    def add_value(self, method: str, index: int, measure: str, value: float) -> None:
-        """Any number about a method and a group."""
-        self.rows.append((method, self.groups[index].name, measure, value))
+    def add_share(
+        self,
+        entry: tuple[str, str],
+        index: int,
+        value: float,
+        *,
+        prefix: str = "",
+        suffix: str = "",
+    ) -> None:
+        """The share of the optimum that an exact return to one group is."""
+        if self.exact is None:
+            raise ValueError("exact must be given to tell shares of the optimum, got None")
+        share = self.exact.share_of_optimum(index, value)
+        self.add_value(entry, index, f"{prefix}share_of_optimum{suffix}", share)
+
+    def add_accuracy(
+        self, entry: tuple[str, str], index: int, *, catered: float, best: float
+    ) -> None:
+        """How well a method ranks for one group: what is given, and the best of its set."""
+        self.add_value(entry, index, "accuracy", catered)
+        self.add_value(entry, index, "best_accuracy", best)
+
+    def add_value(self, entry: tuple[str, str], index: int, measure: str, value: float) -> None:
+        """Any number about a method, a choice and a group."""
+        self.rows.append((*entry, self.groups[index].name, measure, value))
+
+    def add_whole(self, entry: tuple[str, str], measure: str, value: float) -> None:
+        """Any number about a method and all groups together."""
+        self.rows.append((*entry, "all", measure, value))
 
     def add_worst(self) -> None:
-        """What each method's recoveries of all groups come to."""
-        found: dict[str, list[float]] = {}
-        for method, _, measure, value in self.rows:
+        """What each method's recoveries, and shares of the optimum, of all groups come to."""
+        found: dict[tuple[str, tuple[str, str]], list[float]] = {}
+        for method, choice, _, measure, value in self.rows:
+            if measure in ("recovery", "share_of_optimum"):
+                found.setdefault((measure, (method, choice)), []).append(value)
+        for (measure, entry), values in found.items():
+            self.add_whole(entry, f"worst_{measure}", lowest(values))
             if measure == "recovery":
-                found.setdefault(method, []).append(value)
-        for method, values in found.items():
-            self.rows.append((method, "all", "worst_recovery", lowest(values)))
-            self.rows.append((method, "all", "coverage", coverage(values)))
+                self.add_whole(entry, "coverage", coverage(values))
 
-    def add_accuracy(self, method: str, index: int, catered: float, best: float) -> None:
-        """How well a method ranks for one group."""
-        group = self.groups[index].name
-        self.rows.append((method, group, "accuracy", catered))
-        self.rows.append((method, group, "best_accuracy", best))
+    def table(self) -> pd.DataFrame:
+        """The rows so far, as a table."""
+        return pd.DataFrame(self.rows, columns=RESULT_COLUMNS)

@@ -1,34 +1,99 @@
-"""Statistics over groups and seeds: worst group, mean and 95 % interval."""
+"""Statistics over groups and seeds: headline measure, worst group, mean and 95 % interval."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy import stats
 
-from popl_rl.evaluation.method_names import METHODS
+from popl_rl.evaluation.method_names import sort_key
 
-__all__ = ["in_order", "interval", "require_columns", "summary", "worst", "worst_recovery"]
+__all__ = [
+    "HEADLINES",
+    "RESULT_COLUMNS",
+    "entries",
+    "headline_measure",
+    "interval",
+    "read_results",
+    "require_columns",
+    "rows_of",
+    "summary",
+    "worst",
+    "worst_group",
+]
+
+RESULT_COLUMNS = ["method", "choice", "group", "measure", "value"]
+"""Columns of a run's ``results.csv``. ``choice`` tells how the hypothesis was chosen from what the
+method offers, such as ``posterior`` or ``lexicase``; it is empty where there is nothing to choose,
+and for measures of a set as a whole."""
+
+HEADLINES = {"share_of_optimum": "share of optimum", "recovery": "recovery"}
+"""Measures that tell how well a group is served, the preferred one first, and their names."""
 
 
-def worst_recovery(results: pd.DataFrame) -> dict[str, float]:
-    """Recovery of the group that each method serves worst.
+def read_results(path: Path) -> pd.DataFrame:
+    """Read ``results.csv`` of a run or of a benchmark.
 
     Args:
-        results: Tidy rows ``method, group, measure, value``, averaged over repeated rows.
+        path: The file.
 
     Returns:
-        Method -> recovery, without methods whose recovery was not measured in every group.
+        Its rows; an empty choice is an empty string, not NaN.
     """
-    require_columns(results, ["method", "group", "measure", "value"])
-    rows = results[results["measure"] == "recovery"]
-    worst = {}
-    for method in in_order(rows):
-        by_group = rows[rows["method"] == method].groupby("group")["value"].mean()
+    table = pd.read_csv(path, dtype={"choice": "str"})
+    # pandas reads empty text as NaN, which equals nothing and is left out of groups.
+    return table.fillna({"choice": ""}) if "choice" in table else table
+
+
+def headline_measure(results: pd.DataFrame) -> str:
+    """Measure that tells best how well groups are served.
+
+    Args:
+        results: Rows with columns ``measure`` and ``value``.
+
+    Returns:
+        ``share_of_optimum`` where it is known (environments with a transition table), and
+        ``recovery`` elsewhere.
+    """
+    known = results["measure"].eq("share_of_optimum") & results["value"].notna()
+    return "share_of_optimum" if known.any() else "recovery"
+
+
+def entries(results: pd.DataFrame) -> list[tuple[str, str]]:
+    """Methods and choices of a results table, in the order to show them in."""
+    found = results[["method", "choice"]].drop_duplicates().itertuples(index=False, name=None)
+    # sorted() is stable: what is not listed keeps its order.
+    return sorted(((str(m), str(c)) for m, c in found), key=lambda entry: sort_key(*entry))
+
+
+def rows_of(table: pd.DataFrame, method: str, choice: str) -> pd.DataFrame:
+    """Rows of one method and choice."""
+    return table[(table["method"] == method) & (table["choice"] == choice)]
+
+
+def worst_group(results: pd.DataFrame, measure: str = "recovery") -> dict[tuple[str, str], float]:
+    """Value of a measure for the group that each method and choice serves worst.
+
+    Args:
+        results: Tidy rows ``method, choice, group, measure, value``, averaged over repeated rows.
+        measure: The measure.
+
+    Returns:
+        ``(method, choice)`` -> value, without those that were not measured in every group.
+
+    Raises:
+        ValueError: If a column is missing.
+    """
+    require_columns(results, RESULT_COLUMNS)
+    rows = results[results["measure"] == measure]
+    lowest = {}
+    for entry in entries(rows):
+        by_group = rows_of(rows, *entry).groupby("group")["value"].mean()
         if by_group.notna().all():
-            worst[method] = float(by_group.min())
-    return worst
+            lowest[entry] = float(by_group.min())
+    return lowest
 
 
 def interval(
@@ -42,64 +107,71 @@ def interval(
     return float(numbers.mean()), float(stats.t.ppf(0.975, len(numbers) - 1) * error)
 
 
-def summary(runs: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+def summary(runs: Mapping[str, pd.DataFrame], *, measure: str = "recovery") -> pd.DataFrame:
     """What several runs (seeds) of one setting say together.
 
     Args:
-        runs: Tidy rows ``method, group, measure, value`` of each run, by its name.
+        runs: Tidy rows ``method, choice, group, measure, value`` of each run, by its name.
+        measure: What the worst group is looked for in, see :func:`headline_measure`.
 
     Returns:
-        A row per method that has recoveries: ``method``, ``runs``, ``worst_recovery`` (mean over
-        runs of the worst group's) with half-width ``worst_recovery_ci``, ``worst_recovery_min``
-        over runs, and ``accuracy_gap``, the largest distance of a group's accuracy below the
-        oracle's in any run.
+        A row for each method and choice with this measure: ``method``, ``choice``, ``runs``,
+        ``worst_<measure>`` (mean over runs of the worst group's) with half-width
+        ``worst_<measure>_ci``, ``worst_<measure>_min`` over runs, and ``accuracy_gap``, the largest
+        distance of a group's accuracy below the oracle's in any run.
     """
-    worst: dict[str, list[float]] = {}
-    gaps: dict[str, list[float]] = {}
+    lowest: dict[tuple[str, str], list[float]] = {}
+    gaps: dict[tuple[str, str], list[float]] = {}
     for results in runs.values():
-        for method, value in worst_recovery(results).items():
-            worst.setdefault(method, []).append(value)
+        for entry, value in worst_group(results, measure).items():
+            lowest.setdefault(entry, []).append(value)
         accuracy = results[results["measure"] == "accuracy"]
-        by_method = accuracy.pivot_table(index="group", columns="method", values="value")
-        if "oracle" in by_method:
-            for name in by_method:
-                gap = float((by_method["oracle"] - by_method[name]).max())
-                gaps.setdefault(str(name), []).append(gap)
+        by_entry = {
+            entry: rows_of(accuracy, *entry).groupby("group")["value"].mean()
+            for entry in entries(accuracy)
+        }
+        oracle = by_entry.get(("oracle", ""))
+        if oracle is not None:
+            for entry, values in by_entry.items():
+                gaps.setdefault(entry, []).append(float((oracle - values).max()))
     rows = []
-    for method, values in worst.items():
-        mean, half = interval(values)
-        gap = max(gaps.get(method, [float("nan")]))
-        rows.append((method, len(values), mean, half, min(values), gap))
-    columns = ["method", "runs", "worst_recovery", "worst_recovery_ci", "worst_recovery_min"]
-    return pd.DataFrame(rows, columns=[*columns, "accuracy_gap"])
-
-
-def in_order(results: pd.DataFrame) -> list[str]:
-    found = list(results["method"].unique())
-    return [m for m in METHODS if m in found] + [m for m in found if m not in METHODS]
+    for entry, numbers in lowest.items():
+        mean, half = interval(numbers)
+        gap = max(gaps.get(entry, [float("nan")]))
+        rows.append((*entry, len(numbers), mean, half, min(numbers), gap))
+    name = f"worst_{measure}"
+    columns = ["method", "choice", "runs", name, f"{name}_ci", f"{name}_min", "accuracy_gap"]
+    return pd.DataFrame(rows, columns=columns)
 
 
 def worst(results: pd.DataFrame) -> pd.DataFrame:
-    """Recovery of the group that each method serves worst, run by run.
+    """Headline measure of the group that each method serves worst, run by run.
 
     Args:
-        results: Rows as of :func:`collect`.
+        results: Rows ``scenario, seed, method, choice, group, measure, value`` of a benchmark.
 
     Returns:
-        Rows ``scenario, seed, method, value``, without methods whose recovery is unknown in a
-        group, and without the oracle and random actions, which have 1 and 0.
+        Rows ``scenario, seed, method, choice, measure, value``, where ``measure`` is the headline
+        of the scenario. Left out are methods whose value is unknown in a group, and what is so by
+        definition: random actions, of which both measures are 0, and the oracle's recovery of 1.
     """
-    rows = [
-        (scenario, seed, method, value)
-        for (scenario, seed), run in results.groupby(["scenario", "seed"], sort=False)
-        for method, value in worst_recovery(run).items()
-        if method not in ("oracle", "random")
-    ]
-    return pd.DataFrame(rows, columns=["scenario", "seed", "method", "value"])
+    rows = []
+    for scenario, of_scenario in results.groupby("scenario", sort=False):
+        measure = headline_measure(of_scenario)
+        trivial = ("random",) if measure == "share_of_optimum" else ("random", "oracle")
+        for seed, run in of_scenario.groupby("seed", sort=False):
+            for (method, choice), value in worst_group(run, measure).items():
+                if method not in trivial:
+                    rows.append((scenario, seed, method, choice, measure, value))
+    columns = ["scenario", "seed", "method", "choice", "measure", "value"]
+    return pd.DataFrame(rows, columns=columns)
 
 
 def require_columns(table: pd.DataFrame, columns: Sequence[str]) -> None:
     """Raise ValueError, naming what is missing, unless a table has these columns."""
     missing = [column for column in columns if column not in table]
     if missing:
-        raise ValueError(f"the table must have the columns {columns}, {missing} are missing")
+        raise ValueError(
+            f"the table must have the columns {[*columns]}, {missing} are missing; tables of older "
+            "versions must be made again with popl-train or popl-evaluate"
+        )

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from popl_rl.evaluation.method_names import method_name
+from popl_rl.evaluation.method_names import method_name, sort_key
 
 __all__ = ["Scenario", "Suite"]
 
@@ -56,14 +56,21 @@ class Suite:
                 found[axis] = dict(sorted(points.items(), key=lambda point: float(point[1])))
         return found
 
-    def label(self, method: str) -> str:
-        """Name to print for a method of the results."""
-        name = method.removesuffix("_lexicase")
-        if method not in self.methods and name in self.methods:
-            return f"{name}, by lexicase"
-        return method if method in self.methods else method_name(method)
+    def label(self, method: str, choice: str = "") -> str:
+        """Name to print for a method of the results, and how its members were chosen."""
+        if method not in self.methods:
+            return method_name(method, choice)
+        return f"{method}, by lexicase" if choice == "lexicase" else method
 
-    def ordered(self, found: Sequence[str]) -> list[str]:
-        """Methods of the results in the order to show them in: the suite's own first."""
-        own = [name for method in self.methods for name in (method, f"{method}_lexicase")]
-        return [name for name in own if name in found] + [n for n in found if n not in own]
+    def ordered(self, found: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+        """Methods and choices of the results in the order to show them in.
+
+        The suite's own methods come first, each with its choices beside each other; all others keep
+        their order.
+        """
+        own = list(self.methods)
+        places = {
+            entry: (own.index(entry[0]), sort_key(*entry)[1]) if entry[0] in own else (len(own), 0)
+            for entry in found
+        }
+        return sorted(found, key=places.__getitem__)

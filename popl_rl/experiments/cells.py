@@ -11,14 +11,16 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from omegaconf import OmegaConf
 
+from popl_rl.evaluation.statistics import RESULT_COLUMNS, read_results
 from popl_rl.evaluation.suite import Suite
 from popl_rl.experiments.run_folder import load_config
 from popl_rl.storage import write_atomic, write_json
 
 __all__ = ["COLUMNS", "Cell", "claim", "collect", "is_finished", "plan"]
 
-COLUMNS = ["suite", "scenario", "seed", "method", "group", "measure", "value"]
+COLUMNS = ["suite", "scenario", "seed", *RESULT_COLUMNS]
 """Columns of a benchmark's ``results.csv``."""
 
 
@@ -173,11 +175,10 @@ def _without(one: Any, other: Any) -> Any:
 def collect(suite: Suite, cells: Sequence[Cell], run_dir: Path) -> pd.DataFrame:
     """Put the results of finished cells together.
 
-    The rows of what a cell was to train (``popl`` and ``popl_lexicase``, or ``em`` and
-    ``em_lexicase``, ...) get the name of its method. Rows of others,
-    such as the oracle, are the same in all cells of a scenario and seed; those of the first method
-    are kept. The wall time of a cell is its method's measure ``seconds`` of the group ``all``,
-    missing for a cell that was resumed.
+    The rows of what a cell trained, ``method.name`` of its configuration, get the name of its
+    method in the suite. Rows of others, such as the oracle, are the same in all cells of a scenario
+    and seed; those of the first method are kept. The wall time of a cell is its method's measure
+    ``seconds`` of the group ``all``, missing for a cell that was resumed.
 
     Args:
         suite: The suite.
@@ -185,27 +186,25 @@ def collect(suite: Suite, cells: Sequence[Cell], run_dir: Path) -> pd.DataFrame:
         run_dir: Folder of the benchmark.
 
     Returns:
-        Tidy rows ``suite, scenario, seed, method, group, measure, value``.
+        Tidy rows ``suite, scenario, seed, method, choice, group, measure, value``.
 
     Raises:
-        ValueError: If a cell was run as something else, see :func:`is_finished`.
+        ValueError: If a cell was run as something else, see :func:`is_finished`, or has rows of the
+            same name as another's.
     """
     tables = []
     for cell in cells:
         if not is_finished(cell, run_dir):
             continue
         folder = cell.folder(run_dir)
-        rows = pd.read_csv(folder / "results.csv")
-        label = load_config(folder).method.name
-        own = rows["method"].isin([label, f"{label}_lexicase"])
+        rows = read_results(folder / "results.csv")
+        own = rows["method"] == str(OmegaConf.select(load_config(folder), "method.name"))
         if not cell.leads:
             rows, own = rows[own], own[own]
-        suffix = rows["method"].str.endswith("_lexicase").map({True: "_lexicase", False: ""})
-        names = cell.method + suffix.astype(str)
-        rows = rows.assign(method=rows["method"].where(~own, names))
+        rows = rows.assign(method=rows["method"].where(~own, cell.method))
         seconds = json.loads((folder / "cell.json").read_text(encoding="utf-8"))["seconds"]
         if seconds is not None:
-            timed = [(cell.method, "all", "seconds", seconds)]
+            timed = [(cell.method, "", "all", "seconds", seconds)]
             rows = pd.concat([rows, pd.DataFrame(timed, columns=list(rows))], ignore_index=True)
         tables.append(rows.assign(suite=suite.name, scenario=cell.scenario, seed=cell.seed))
     if not tables:

@@ -10,12 +10,20 @@ from rich.table import Table
 from rich.text import Text
 
 from popl_rl.evaluation.method_names import method_name
-from popl_rl.evaluation.statistics import in_order, interval, require_columns, worst_recovery
+from popl_rl.evaluation.statistics import (
+    HEADLINES,
+    RESULT_COLUMNS,
+    entries,
+    headline_measure,
+    interval,
+    require_columns,
+    rows_of,
+    worst_group,
+)
 from popl_rl.experiments.markdown import markdown_table
 
 __all__ = ["markdown", "results_table"]
 
-_MEASURES = ("return", "recovery", "success", "accuracy")
 _SHARES = ("success", "accuracy")
 
 _WORDS = {
@@ -23,10 +31,14 @@ _WORDS = {
     "POPL (catered)": "the policy that the policy set offers to a new rater of the group after a "
     "few answers.",
     "oracle": "trained on the answers of this group alone, so it knows what POPL has to find out.",
+    "share of optimum": "(return − random) / (optimum − random), of exact returns, where the "
+    "environment lists its transitions: 1 is the best that the group can get at all, 0 as bad as "
+    "random actions.",
     "return": "sum over an episode of what the group's raters value, averaged over episodes.",
     "recovery": "(return − floor) / (oracle's return − floor): 1 is as good as the oracle, 0 as "
-    "bad as random actions, or as what `evaluation.reference` names in their place. The worst "
-    "group's recovery is what counts: a method that serves the majority alone has a low one.",
+    "bad as random actions, or as what `evaluation.reference` names in their place.",
+    "worst-served group": "the one with the lowest share of the optimum, or recovery where that is "
+    "unknown. It is what counts: a method that serves the majority alone has a low one.",
     "success": "share of episodes that fulfil the task, whatever the group wants besides.",
     "accuracy": "share of pairs of segments, not used in training, that the policy ranks as the "
     "group does; 50 % is guessing.",
@@ -37,18 +49,20 @@ def results_table(results: pd.DataFrame) -> Table:
     """Lay out results for a terminal: a row for each method and group.
 
     Args:
-        results: Tidy rows ``method, group, measure, value``. Several rows of a method, group and
-            measure, such as seeds, are shown as their mean and its 95 % interval.
+        results: Tidy rows ``method, choice, group, measure, value``. Several rows of the same, such
+            as seeds, are shown as their mean and its 95 % interval.
 
     Returns:
-        Columns return, recovery, success and accuracy, with a dash for what was not measured.
+        Columns return, share of optimum (recovery where that is unknown), success and accuracy,
+        with a dash for what was not measured.
 
     Raises:
         ValueError: If a column is missing.
     """
+    require_columns(results, RESULT_COLUMNS)
     table = Table("method", "raters who want", title="How well is each group served?")
-    for measure in _MEASURES:
-        table.add_column(measure, justify="right")
+    for measure in _measures(results):
+        table.add_column(HEADLINES.get(measure, measure), justify="right")
     previous = None
     for method, group, *cells in _rows(results):
         if previous not in (None, method):
@@ -64,7 +78,7 @@ def markdown(
     """Write the text of a report.
 
     Args:
-        results: Tidy rows ``method, group, measure, value``.
+        results: Tidy rows ``method, choice, group, measure, value``.
         title: Heading.
         about: What was run, such as environment, groups and seed.
         figures: Pictures, relative to the folder of the report.
@@ -81,19 +95,24 @@ def markdown(
             f"figures must be relative to the report's folder, so that it can be moved, got "
             f"{absolute}; use figure.relative_to(run_dir)"
         )
+    require_columns(results, RESULT_COLUMNS)
+    measures, headline = _measures(results), headline_measure(results)
+    # 0 by definition, as a recovery of the oracle is 1.
+    trivial = ("random",) if headline == "share_of_optimum" else ("random", "oracle")
     worst = [
-        f"{method_name(method)} **{value:z.2f}**"
-        for method, value in worst_recovery(results).items()
-        if method not in ("oracle", "random")  # 1 and 0 by definition
+        f"{method_name(*entry)} **{value:z.2f}**"
+        for entry, value in worst_group(results, headline).items()
+        if entry[0] not in trivial
     ]
     blocks = [f"# {title}"]
     if about:
         blocks.append(markdown_table(["", ""], [[key, value] for key, value in about.items()]))
     blocks.append("## How well is each group served?")
     if worst:
-        blocks.append(f"Recovery of the worst-served group: {', '.join(worst)}.")
-    head = ["method", "raters who want", *_MEASURES]
-    blocks.append(markdown_table(head, _rows(results), right=len(_MEASURES)))
+        name = HEADLINES[headline].capitalize()
+        blocks.append(f"{name} of the worst-served group: {', '.join(worst)}.")
+    head = ["method", "raters who want", *(HEADLINES.get(name, name) for name in measures)]
+    blocks.append(markdown_table(head, _rows(results), right=len(measures)))
     blocks.append("Every number measured is in `results.csv`.")
     for figure in figures:
         name = figure.stem.replace("_", " ")
@@ -103,17 +122,21 @@ def markdown(
     return "\n\n".join(blocks) + "\n"
 
 
+def _measures(results: pd.DataFrame) -> list[str]:
+    return ["return", headline_measure(results), "success", "accuracy"]
+
+
 def _rows(results: pd.DataFrame) -> Iterator[list[str]]:
-    require_columns(results, ["method", "group", "measure", "value"])
-    for method in in_order(results):
-        of_method = results[results["method"] == method]
+    measures = _measures(results)
+    for entry in entries(results):
+        of_method = rows_of(results, *entry)
         for group in of_method["group"].unique():
             of_group = of_method[of_method["group"] == group]
             values = {name: rows["value"] for name, rows in of_group.groupby("measure")}
-            if not set(values) & set(_MEASURES):
+            if not set(values) & set(measures):
                 continue
-            cells = [_cell(name, values.get(name, pd.Series(dtype=float))) for name in _MEASURES]
-            yield [method_name(method), str(group), *cells]
+            cells = [_cell(name, values.get(name, pd.Series(dtype=float))) for name in measures]
+            yield [method_name(*entry), str(group), *cells]
 
 
 def _cell(measure: str, values: pd.Series) -> str:

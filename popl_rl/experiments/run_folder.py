@@ -26,6 +26,7 @@ __all__ = [
     "Progress",
     "RunLogger",
     "create_run_dir",
+    "git_state",
     "load_config",
     "make_logger",
     "save_config",
@@ -130,7 +131,7 @@ def write_metadata(run_dir: Path, *, command: Sequence[str]) -> None:
     entry: dict[str, Any] = {
         "started": datetime.now().astimezone().isoformat(timespec="seconds"),
         "command": shlex.join(command),
-        "git": _git(Path(__file__).parents[1]),
+        "git": git_state(Path(__file__).parents[1]),
         "platform": platform.platform(),
         "device": torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
         "versions": {
@@ -153,7 +154,16 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _git(checkout: Path) -> dict[str, Any] | None:
+def git_state(checkout: Path) -> dict[str, Any] | None:
+    """Tell what a checkout holds: its commit, and whether files differ from it.
+
+    Args:
+        checkout: Root of the checkout.
+
+    Returns:
+        ``commit`` and ``dirty``; None without git, or where the folder is no checkout of its own.
+    """
+
     def ask(*question: str) -> str:
         command = ["git", "-C", str(checkout), *question]
         return subprocess.run(

@@ -9,12 +9,12 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from popl_rl.evaluation.method_names import METHODS
 from popl_rl.evaluation.suite import Scenario, Suite
 
 __all__ = ["load_suite", "parse_suite"]
 
 _NAME = re.compile(r"[A-Za-z0-9][\w.-]*")
-_BASELINES = ("cpl", "bradley_terry", "oracle", "clone", "random", "brex")
 # Settings that the benchmark makes itself.
 _OURS = (
     "seed",
@@ -72,8 +72,7 @@ def parse_suite(name: str, definition: object) -> Suite:
     for method, listed in _named(content, "methods", problems):
         where = f"methods.{method}"
         methods[method] = _overrides(listed, where, (*_OURS, *_SHARED), problems)
-    taken = {*_BASELINES, *(f"{method}_lexicase" for method in methods)}
-    for method in taken.intersection(methods):
+    for method in [name for name in methods if name in METHODS and METHODS[name].is_reference]:
         problems.append(f"methods.{method} has the name of other rows of results.csv; rename it")
     scenarios: dict[str, Scenario] = {}
     for scenario, details in _named(content, "scenarios", problems):

@@ -12,36 +12,42 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import NullLocator
 from numpy.typing import NDArray
 
-from popl_rl.evaluation.statistics import interval, worst
+from popl_rl.evaluation.statistics import entries, headline_measure, interval, worst
 from popl_rl.evaluation.suite import Suite
-from popl_rl.plotting.benchmark_style import axis_positions, method_columns, method_styles
+from popl_rl.plotting.benchmark_style import (
+    axis_positions,
+    explain_headline,
+    headline_name,
+    method_columns,
+    method_styles,
+    of_single_policies,
+)
 from popl_rl.plotting.style import LEGEND, PALETTE, headline, tidy
 
 __all__ = ["catering_curves", "recovery_along_axes", "scenario_dots"]
 
 _LOWEST, _HIGHEST = -0.5, 1.25  # recoveries beyond are drawn at the edge
-BASELINE_COLOURS = ("cpl", "bradley_terry")
-_KINDS = {"": "posterior catering", "_lexicase": "lexicase catering"}
+_KINDS = {"posterior": "posterior catering", "lexicase": "lexicase catering"}
 
 
 def scenario_dots(suite: Suite, results: pd.DataFrame) -> Figure:
-    """Recovery of the worst-served group: a panel for each scenario, a line for each method.
+    """The worst-served group's headline: a panel for each scenario, a line for each method.
 
     Bars of more than a few methods cannot be read any more; this can.
 
     Args:
         suite: The suite.
-        results: Rows as of :func:`popl_rl.experiments.cells.collect`; of what methods are compared with,
-            only a policy for everybody is shown, and other ways to cater not at all.
+        results: Rows as of :func:`popl_rl.experiments.cells.collect`; of what methods are compared
+            with, only a policy for everybody and the oracle are shown, and other ways to cater not
+            at all.
 
     Raises:
         ValueError: If no recovery is known.
     """
-    table = worst(results)
-    table = table[table["method"].isin([*suite.methods, *BASELINE_COLOURS])]
+    table = of_single_policies(suite, worst(results))
     if table.empty:
         raise ValueError("results must hold the recovery of some method in every group, got none")
-    methods = suite.ordered(list(table["method"].unique()))
+    methods = _methods_of(suite, table)
     scenarios = list(table["scenario"].unique())
     styles = method_styles(suite, methods)
     columns = min(3, len(scenarios))
@@ -51,7 +57,7 @@ def scenario_dots(suite: Suite, results: pd.DataFrame) -> Figure:
     headline(
         fig,
         "How well is the worst-served group served?",
-        "Recovery: 1 as good as the oracle, 0 as the floor; drawn from −0.5 to 1.25.\n"
+        f"{explain_headline(table)}; drawn from −0.5 to 1.25.\n"
         "Small dots are seeds, large ones their mean with its 95 % interval.",
     )
     axes = fig.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
@@ -80,18 +86,18 @@ def scenario_dots(suite: Suite, results: pd.DataFrame) -> Figure:
     axes[0, 0].set(xlim=(low - 0.04, _HIGHEST + 0.04), ylim=(len(methods) - 0.5, -0.5))
     _switch_off(axes, len(scenarios))
     for ax in axes.flat[max(0, len(scenarios) - columns) : len(scenarios)]:
-        ax.set_xlabel("recovery")
+        ax.set_xlabel(headline_name(table))
         ax.tick_params(labelbottom=True)
     return fig
 
 
 def catering_curves(suite: Suite, results: pd.DataFrame) -> Figure:
-    """Recovery of the worst-served group by the number of answers that a new rater has given.
+    """The worst-served group's headline by the number of answers that a new rater has given.
 
     Args:
         suite: The suite.
-        results: Rows as of :func:`popl_rl.experiments.cells.collect`, with measures ``recovery@<answers>``
-            and ``best_recovery``.
+        results: Rows as of :func:`popl_rl.experiments.cells.collect`, with measures such as
+            ``recovery@10`` and ``best_recovery``.
 
     Returns:
         A row of panels for each scenario, a panel for each kind of catering, a curve for each
@@ -104,7 +110,7 @@ def catering_curves(suite: Suite, results: pd.DataFrame) -> Figure:
     if table.empty:
         raise ValueError("results must hold measures such as recovery@10, got none")
     scenarios = list(table["scenario"].unique())
-    methods = suite.ordered(list(table["method"].unique()))
+    methods = _methods_of(suite, table)
     answers = sorted(table.loc[np.isfinite(table["answers"]), "answers"].unique())
     x = dict(zip(answers, np.log10(answers), strict=True))
     x[math.inf] = float(np.log10(answers[-1])) + 0.35
@@ -113,16 +119,17 @@ def catering_curves(suite: Suite, results: pd.DataFrame) -> Figure:
     headline(
         fig,
         "How many answers does it take to find a new rater's policy?",
-        "Recovery of the worst-served group, with 95 % intervals over seeds. On the right: of the "
-        "best member in hindsight.",
+        f"{headline_name(table).capitalize()} of the worst-served group, with 95 % intervals over "
+        "seeds. On the right: of the\nbest member in hindsight.",
     )
     axes = fig.subplots(len(scenarios), 2, squeeze=False, sharex=True, sharey=True)
     low = max(_LOWEST, min(0.0, float(table["value"].min())))
     for row, scenario in enumerate(scenarios):
-        for ax, (suffix, kind) in zip(axes[row], _KINDS.items(), strict=True):
+        of_scenario = table[table["scenario"] == scenario]
+        for ax, (choice, kind) in zip(axes[row], _KINDS.items(), strict=True):
             for method in methods:
-                chosen = (table["scenario"] == scenario) & (table["method"] == method)
-                rows = table[chosen & table["kind"].isin([suffix, "best"])]
+                chosen = of_scenario["method"] == method
+                rows = of_scenario[chosen & of_scenario["choice"].isin([choice, "best"])]
                 _curve(ax, rows, x, styles[method])
             ax.axhline(1, color="black", linewidth=1, linestyle="--", zorder=0)
             ax.set_xticks(list(x.values()), [*(f"{number:g}" for number in answers), "best"])
@@ -130,7 +137,7 @@ def catering_curves(suite: Suite, results: pd.DataFrame) -> Figure:
             tidy(ax)
             if row == 0:
                 ax.set_title(kind, fontsize=10)
-        axes[row, 0].set_ylabel(f"{scenario}\nrecovery")
+        axes[row, 0].set_ylabel(f"{scenario}\n{headline_name(of_scenario)}")
     axes[0, 0].set_ylim(low - 0.03, _HIGHEST)
     for ax in axes[-1]:
         ax.set_xlabel("answers of a new rater")
@@ -139,7 +146,7 @@ def catering_curves(suite: Suite, results: pd.DataFrame) -> Figure:
 
 
 def recovery_along_axes(suite: Suite, results: pd.DataFrame) -> Figure:
-    """Recovery of the worst-served group along each axis of a suite, a panel for each.
+    """The worst-served group's headline along each axis of a suite, a panel for each.
 
     Args:
         suite: A suite with axes.
@@ -148,8 +155,7 @@ def recovery_along_axes(suite: Suite, results: pd.DataFrame) -> Figure:
     Raises:
         ValueError: If no method has recoveries at two points of an axis.
     """
-    table = worst(results)
-    table = table[table["method"].isin([*suite.methods, *BASELINE_COLOURS])]
+    table = of_single_policies(suite, worst(results))
     drawn = {}
     for axis, points in suite.axes().items():
         of_axis = table[table["scenario"].isin(list(points))]
@@ -158,7 +164,7 @@ def recovery_along_axes(suite: Suite, results: pd.DataFrame) -> Figure:
             drawn[axis] = of_axis[along]
     if not drawn:
         raise ValueError("results must hold recoveries at two points of an axis, got none")
-    methods = suite.ordered(list(pd.concat(drawn.values())["method"].unique()))
+    methods = _methods_of(suite, pd.concat(drawn.values()))
     styles = method_styles(suite, methods)
     columns = min(3, len(drawn))
     lines = math.ceil(len(drawn) / columns)
@@ -166,7 +172,8 @@ def recovery_along_axes(suite: Suite, results: pd.DataFrame) -> Figure:
     headline(
         fig,
         "What makes it harder to serve everybody?",
-        "Recovery of the worst-served group, with 95 % intervals over seeds; cut off below −0.5.",
+        f"{headline_name(table).capitalize()} of the worst-served group, with 95 % intervals over "
+        "seeds; cut off below −0.5.",
     )
     axes = fig.subplots(lines, columns, squeeze=False, sharey=True)
     low = max(_LOWEST, min(0.0, float(table["value"].min())))
@@ -174,7 +181,7 @@ def recovery_along_axes(suite: Suite, results: pd.DataFrame) -> Figure:
         points = {n: at for n, at in suite.axes()[axis].items() if n in set(rows["scenario"])}
         places = dict(zip(points, axis_positions(list(points.values())), strict=True))
         for method in methods:
-            of_method = rows[rows["method"] == method].assign(kind="")
+            of_method = rows[rows["method"] == method]
             _curve(ax, of_method.assign(answers=of_method["scenario"]), places, styles[method])
         ax.set_xticks(list(places.values()), [str(value) for value in points.values()])
         ax.xaxis.set_minor_locator(NullLocator())
@@ -182,39 +189,48 @@ def recovery_along_axes(suite: Suite, results: pd.DataFrame) -> Figure:
         ax.set_xlabel(axis)
         tidy(ax)
     for row in axes:
-        row[0].set_ylabel("recovery")
+        row[0].set_ylabel(headline_name(table))
     axes[0, 0].set_ylim(low - 0.03, _HIGHEST)
     _switch_off(axes, len(drawn))
     _legend(fig, suite, methods, styles)
     return fig
 
 
-def _by_answers(suite: Suite, results: pd.DataFrame) -> pd.DataFrame:
-    """Worst group's recovery ``scenario, seed, method, kind, answers, value`` of own methods.
+def _methods_of(suite: Suite, table: pd.DataFrame) -> list[str]:
+    """Methods in the suite's order, whatever was chosen how."""
+    return list(dict.fromkeys(method for method, _ in suite.ordered(entries(table))))
 
-    The best in hindsight is of kind ``best`` and has infinitely many answers.
+
+def _by_answers(suite: Suite, results: pd.DataFrame) -> pd.DataFrame:
+    """Worst group's ``scenario, seed, method, choice, measure, answers, value`` of own methods.
+
+    The best in hindsight is of choice ``best`` and has infinitely many answers.
     """
-    parts = results["measure"].str.extract(r"^recovery@(\d+)$")[0]
-    best = results["measure"] == "best_recovery"
-    answers = parts.astype(float).where(~best, math.inf)
-    name = results["method"].str.removesuffix("_lexicase")
-    lexicase = results["method"].ne(name) & ~results["method"].isin(list(suite.methods))
-    method = results["method"].where(~lexicase, name)
-    kind = lexicase.map({True: "_lexicase", False: ""}).where(~best, "best")
-    rows = results.assign(method=method, kind=kind, answers=answers)
-    rows = rows[answers.notna() & method.isin(list(suite.methods)) & rows["value"].notna()]
-    keys = ["scenario", "seed", "method", "kind", "answers"]
-    return rows.groupby(keys, sort=False)["value"].min().reset_index()
+    tables = []
+    for _, rows in results.groupby("scenario", sort=False):
+        measure = headline_measure(rows)
+        best = rows["measure"] == f"best_{measure}"
+        parts = rows["measure"].str.extract(rf"^{measure}@(\d+)$")[0]
+        answers = parts.astype(float).where(~best, math.inf)
+        choice = rows["choice"].where(~best, "best")
+        tables.append(rows.assign(choice=choice, answers=answers, measure=measure))
+    if not tables:
+        return results.assign(answers=[])
+    table = pd.concat(tables)
+    known = table["answers"].notna() & table["value"].notna()
+    table = table[known & table["method"].isin(list(suite.methods))]
+    keys = ["scenario", "seed", "method", "choice", "measure", "answers"]
+    return table.groupby(keys, sort=False)["value"].min().reset_index()
 
 
 def _curve(ax: Axes, rows: pd.DataFrame, places: dict[Any, float], style: tuple[str, str]) -> None:
-    """One method's means with a band; what is of kind ``best`` stands apart, on a dotted line."""
+    """One method's means with a band; what is of choice ``best`` stands apart, on a dotted line."""
     colour, marker = style
     means: dict[str, list[tuple[float, float, float]]] = {"best": [], "": []}
     for at, x in places.items():
         values = rows.loc[rows["answers"] == at]
         if len(values):
-            kind = "best" if values["kind"].iloc[0] == "best" else ""
+            kind = "best" if values["choice"].iloc[0] == "best" else ""
             means[kind].append((x, *interval(values["value"].to_numpy(dtype=float))))
     line: NDArray[np.float64] = np.array(means[""]).reshape(-1, 3).T
     if not line.size and not means["best"]:

@@ -11,11 +11,14 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import NullLocator, PercentFormatter
 from numpy.typing import NDArray
 
-from popl_rl.evaluation.statistics import interval, worst
+from popl_rl.evaluation.statistics import entries, interval, rows_of, worst
 from popl_rl.evaluation.suite import Suite
 from popl_rl.plotting.benchmark_style import (
     BASELINE_COLOURS,
     axis_positions,
+    ends_of_scale,
+    explain_headline,
+    headline_name,
     method_columns,
     method_styles,
 )
@@ -27,7 +30,7 @@ _LOWEST, _HIGHEST = -0.5, 1.25  # recoveries beyond are cut off
 
 
 def scenario_bars(suite: Suite, results: pd.DataFrame) -> Figure:
-    """Recovery of the worst-served group: a bar for each scenario and method.
+    """The worst-served group's headline: a bar for each scenario and method.
 
     Args:
         suite: The suite.
@@ -43,25 +46,26 @@ def scenario_bars(suite: Suite, results: pd.DataFrame) -> Figure:
     table = worst(results)
     if table.empty:
         raise ValueError("results must hold the recovery of some method in every group, got none")
-    methods = suite.ordered(list(table["method"].unique()))
+    methods = suite.ordered(entries(table))
     scenarios = list(table["scenario"].unique())
     fig = Figure(figsize=(max(5.0, len(scenarios) * (0.28 * len(methods) + 0.35)) + 2.4, 4.4))
     headline(
         fig,
         "How well is the worst-served group served?",
-        "Recovery: (return − floor) / (oracle's return − floor), cut off below −0.5.\n"
+        f"{explain_headline(table)}, cut off below −0.5.\n"
         "Dots are seeds, bars their mean with its 95 % interval.",
     )
     ax = fig.subplots()
     width = 0.84 / len(methods)
-    styles = method_styles(suite, methods)
-    for index, method in enumerate(methods):
-        label = suite.label(method)
+    styles = method_styles(suite, [method for method, _ in methods])
+    for index, (method, choice) in enumerate(methods):
+        label = suite.label(method, choice)
         colour = styles[method][0]
-        catered_otherwise = method.endswith("_lexicase") and method not in suite.methods
+        catered_otherwise = choice == "lexicase"
+        of_method = rows_of(table, method, choice)
         for place, scenario in enumerate(scenarios):
-            chosen = (table["method"] == method) & (table["scenario"] == scenario)
-            values = table.loc[chosen, "value"].to_numpy(dtype=float)
+            chosen = of_method["scenario"] == scenario
+            values = of_method.loc[chosen, "value"].to_numpy(dtype=float)
             if not len(values):
                 continue
             x = place + (index - (len(methods) - 1) / 2) * width
@@ -81,10 +85,11 @@ def scenario_bars(suite: Suite, results: pd.DataFrame) -> Figure:
                 ax.scatter(np.full(len(values), x), values, s=7, color=PALETTE["grey"], zorder=3)
     ax.axhline(1, color="black", linewidth=1, linestyle="--", zorder=0)
     ax.axhline(0, color="black", linewidth=1)
-    legend_beside(ax, "as good as the oracle", 1, "black")
-    legend_beside(ax, "as good as\nthe floor", 0, "black")
+    one, zero = ends_of_scale(table)
+    legend_beside(ax, one, 1, "black")
+    legend_beside(ax, zero, 0, "black")
     low = _LOWEST if table["value"].min() < 0 else 0.0
-    ax.set(ylabel="recovery", ylim=(low, _HIGHEST))
+    ax.set(ylabel=headline_name(table), ylim=(low, _HIGHEST))
     ax.set_xticks(range(len(scenarios)), [name.replace("_", "\n", 1) for name in scenarios])
     ax.tick_params(axis="x", length=0)
     fig.legend(loc="outside lower center", ncols=method_columns(fig), **LEGEND)
@@ -100,16 +105,17 @@ def sweep_panels(suite: Suite, results: pd.DataFrame) -> Figure:
         results: Rows as of :func:`popl_rl.experiments.cells.collect`.
 
     Returns:
-        A line for each method that runs along the axis: solid for what new raters are given,
-        with 95 % intervals
-        over seeds as bands; dashed for the best member.
+        A line for each method that runs along the axis: solid for what new raters are given, with
+        95 % intervals over seeds as bands; dashed for the best member.
 
     Raises:
         ValueError: If no method has accuracies at two points of an axis.
     """
     table = results[results["measure"].isin(["accuracy", "best_accuracy"])]
     # Of what methods are compared with, only what bounds them: more lines cannot be read.
-    shown = table["method"].isin([*suite.methods, *BASELINE_COLOURS])
+    shown = table["method"].isin([*suite.methods, *BASELINE_COLOURS]) & (
+        table["choice"] != "lexicase"
+    )
     table = table[shown & table["value"].notna()]
     drawn = {}
     for axis, points in suite.axes().items():
@@ -121,7 +127,7 @@ def sweep_panels(suite: Suite, results: pd.DataFrame) -> Figure:
         raise ValueError("results must hold accuracies at two points of an axis, got none")
     found = pd.concat(drawn.values())
     groups = list(found["group"].unique())
-    methods = suite.ordered(list(found["method"].unique()))
+    methods = list(dict.fromkeys(method for method, _ in suite.ordered(entries(found))))
     styles = method_styles(suite, methods)
     fig = Figure(figsize=(max(2.5 * len(drawn) + 0.8, 5.0), 2.1 * len(groups) + 1.8))
     headline(

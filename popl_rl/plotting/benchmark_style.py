@@ -4,26 +4,31 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from popl_rl.evaluation.method_names import METHODS, drawn_references
+from popl_rl.evaluation.statistics import HEADLINES
 from popl_rl.evaluation.suite import Suite
 from popl_rl.plotting.style import PALETTE
 
-__all__ = ["BASELINE_COLOURS", "axis_positions", "method_columns", "method_styles"]
-
+__all__ = [
+    "BASELINE_COLOURS",
+    "axis_positions",
+    "ends_of_scale",
+    "explain_headline",
+    "headline_name",
+    "method_columns",
+    "method_styles",
+    "of_single_policies",
+]
 
 _COLOURS = tuple(PALETTE[name] for name in ("blue", "vermilion", "green", "purple", "sky"))
-
-
 _MARKERS = ("o", "s", "^", "D", "v")
 
-
-BASELINE_COLOURS = {
-    "cpl": PALETTE["orange"],
-    "bradley_terry": PALETTE["orange"],
-    "oracle": PALETTE["black"],
-}
+BASELINE_COLOURS = {name: PALETTE[METHODS[name].colour] for name in drawn_references()}
+"""Colours of what every figure shows beside the methods of a suite."""
 
 
 def method_styles(suite: Suite, methods: Sequence[str]) -> dict[str, tuple[str, str]]:
@@ -34,8 +39,7 @@ def method_styles(suite: Suite, methods: Sequence[str]) -> dict[str, tuple[str, 
         if name in BASELINE_COLOURS:
             found[name] = (BASELINE_COLOURS[name], "x")
         elif name not in found:
-            base = name.removesuffix("_lexicase")
-            found[name] = found[base] if base in found else next(free)
+            found[name] = next(free)
     return found
 
 
@@ -52,3 +56,46 @@ def axis_positions(values: Sequence[float | str]) -> NDArray[np.float64]:
     if numbers.min() > 0 and numbers.max() >= 5 * numbers.min():
         numbers = np.log10(numbers)
     return numbers
+
+
+def of_single_policies(suite: Suite, table: pd.DataFrame) -> pd.DataFrame:
+    """Rows of a suite's own methods by their headline choice, and of what every figure shows.
+
+    Other ways to cater, and other methods to compare with, are more lines than can be read.
+    """
+    shown = table["method"].isin([*suite.methods, *BASELINE_COLOURS])
+    return table[shown & (table["choice"] != "lexicase")]
+
+
+def headline_name(table: pd.DataFrame) -> str:
+    """Name of what an axis shows; both if scenarios differ in their headline measure.
+
+    Args:
+        table: Rows as of :func:`popl_rl.evaluation.statistics.worst`.
+    """
+    found = set(table["measure"])
+    return ", or ".join(name for measure, name in HEADLINES.items() if measure in found)
+
+
+def explain_headline(table: pd.DataFrame) -> str:
+    """Definition of what an axis shows, for a caption.
+
+    Args:
+        table: Rows as of :func:`popl_rl.evaluation.statistics.worst`.
+    """
+    if set(table["measure"]) == {"share_of_optimum"}:
+        return "Share of optimum: (return − random) / (optimum − random)"
+    if set(table["measure"]) == {"recovery"}:
+        return "Recovery: (return − floor) / (oracle's return − floor)"
+    return "Share of the optimum where it is known, recovery of the oracle's return elsewhere"
+
+
+def ends_of_scale(table: pd.DataFrame) -> tuple[str, str]:
+    """What 1 and 0 on an axis mean.
+
+    Args:
+        table: Rows as of :func:`popl_rl.evaluation.statistics.worst`.
+    """
+    if set(table["measure"]) == {"share_of_optimum"}:
+        return "the optimum", "as good as\nrandom actions"
+    return "as good as the oracle", "as good as\nthe floor"

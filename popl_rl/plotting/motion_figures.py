@@ -56,7 +56,7 @@ def draw_motion(
     for (method, name), episodes in board.episodes.items():
         if method == "oracle":
             marks[f"oracle of {name}"] = _place(episodes, evaluator)[0].tolist()
-        elif method == "cpl":
+        elif method == "pooled_cpl":
             # One policy for everybody, whoever judges it.
             marks["pooled CPL"] = _place(episodes, evaluator)[0].tolist()
             curves["pooled CPL"] = profile(episodes[0], measure)

@@ -11,7 +11,9 @@ from popl_rl.evaluation.results import Scoreboard
 from popl_rl.keys import OBSERVATION
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.reward_set import RewardSet
-from popl_rl.plotting.utility_plots import Curves, agreement, majority_figure, utilities
+from popl_rl.plotting.agreement_plots import agreement
+from popl_rl.plotting.majority_plots import majority_figure
+from popl_rl.plotting.utility_plots import Curves, utilities
 from popl_rl.raters.condorcet import find_cycle, majority_preference
 
 __all__ = ["draw_rewards"]
@@ -37,8 +39,8 @@ def draw_rewards(
         reward_baselines: B-REX and DPL.
 
     Returns:
-        Figures by name: ``utilities``, ``agreement`` and, with more than two groups, ``majority_preference``.
-        Empty where policies act, or a state has more than one coordinate.
+        Figures by name: ``utilities``, ``agreement`` and, with more than two groups,
+        ``majority``. Empty where policies act, or a state has more than one coordinate.
     """
     if not isinstance(evaluator.acting, Choosing) or not isinstance(rewards, RewardSet):
         return {}

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
@@ -13,11 +14,15 @@ from popl_rl.algorithms.reward_baselines import RewardBaselines
 from popl_rl.data.environments import World
 from popl_rl.data.rollouts import MASK
 from popl_rl.evaluation.evaluator import Evaluator
+from popl_rl.evaluation.method_names import method_name
 from popl_rl.evaluation.results import Scoreboard
+from popl_rl.evaluation.statistics import headline_measure
 from popl_rl.keys import INFO
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.plotting import run_plots as plots
+from popl_rl.plotting.member_plots import members
 from popl_rl.plotting.motion_figures import animate, draw_motion
+from popl_rl.plotting.recovery_plots import recovery_bars
 from popl_rl.plotting.reward_figures import draw_rewards
 from popl_rl.plotting.style import save
 
@@ -69,59 +74,23 @@ def draw(
     """
     folder = run_dir / "figures"
     folder.mkdir(exist_ok=True)
-    names = [group.name for group in evaluator.groups]
     metrics = pd.read_csv(run_dir / "metrics.csv")
-    figures = {
-        "learning": plots.learning_curves(metrics),
-    }
+    figures = {"learning": plots.learning_curves(metrics)}
     if "selection_depth" in metrics:
         figures["selection"] = plots.selection(metrics)
+    # Recovery is open without an oracle, or with one no better than random.
     table = board.results
-    measured = (table.measure == "recovery") & ~table.method.isin(["oracle", "random"])
+    measured = (table.measure == headline_measure(table)) & ~table.method.isin(["oracle", "random"])
     if table.value[measured].notna().any():
-        # Recovery is open without an oracle, or with one no better than random.
-        figures["recovery"] = plots.recovery_bars(
-            board.results, floor=_FLOORS[evaluator.config.reference]
-        )
+        floor = _FLOORS[evaluator.config.reference]
+        figures["recovery"] = recovery_bars(table, floor=floor)
     history = run_dir / "history.csv"
-    if history.exists() and len(names) > 1:
+    if history.exists() and len(evaluator.groups) > 1:
         snapshots = pd.read_csv(history)
-        columns = [
-            [c for c in map(str, snapshots) if c.rsplit("/", 1)[0] == name] for name in names
-        ]
-        accuracy = np.stack([snapshots[column].to_numpy() for column in columns], -1)
-        pooled, oracle = None, None
-        if baselines is not None:
-            rows = evaluator.accuracy(baselines).numpy()
-            pooled = rows[0]
-            oracle = {name: rows[1 + index] for index, name in enumerate(names)}
-        figures["members"] = plots.members(
-            accuracy,
-            snapshots.generation.tolist(),
-            names,
-            catered={
-                name: found.origin[index] for name, index in board.catered.items() if found.origin
-            },
-            pooled=pooled,
-            oracle=oracle,
-        )
+        figures["members"] = _draw_members(snapshots, found, baselines, board, evaluator)
     cells = getattr(world.env.unwrapped, "cells", None)
     if cells is not None:
-        maps = {
-            f"set, catered to {name}": occupancy_map(board.episodes[board.label, name], cells)
-            for name in names
-        }
-        if baselines is not None:
-            pooled_name = "cpl" if ("cpl", names[0]) in board.episodes else "bradley_terry"
-            title = plots.method_name(pooled_name)
-            maps[title] = occupancy_map(board.episodes[pooled_name, names[0]], cells)
-        figures["occupancy"] = plots.occupancy(
-            picture(world),
-            maps,
-            suptitle="Where the policies go",
-            caption="Each rater group gets its own policy from the set; pooled CPL is one policy "
-            "for everybody.",
-        )
+        figures["occupancy"] = _draw_occupancy(cells, board, evaluator, world)
     figures |= draw_motion(found, board=board, evaluator=evaluator)
     figures |= draw_rewards(
         found, baselines, board=board, evaluator=evaluator, reward_baselines=reward_baselines
@@ -137,6 +106,55 @@ def draw(
             # Pictures that need a renderer are no reason to lose a run that is done.
             warnings.warn(f"no animations were made: {error}", stacklevel=2)
     return paths
+
+
+def _draw_members(
+    snapshots: pd.DataFrame,
+    found: HypothesisSet,
+    baselines: HypothesisSet | None,
+    board: Scoreboard,
+    evaluator: Evaluator,
+) -> Figure:
+    """Draw the accuracies of all members in all generations that were written down."""
+    names = [group.name for group in evaluator.groups]
+    columns = [[c for c in map(str, snapshots) if c.rsplit("/", 1)[0] == name] for name in names]
+    accuracy = np.stack([snapshots[column].to_numpy() for column in columns], -1)
+    pooled, oracle = None, None
+    if baselines is not None:
+        rows = evaluator.accuracy(baselines).numpy()
+        pooled = rows[0]
+        oracle = {name: rows[1 + index] for index, name in enumerate(names)}
+    return members(
+        accuracy,
+        snapshots.generation.tolist(),
+        names,
+        catered={
+            name: found.origin[index] for name, index in board.catered.items() if found.origin
+        },
+        pooled=pooled,
+        oracle=oracle,
+    )
+
+
+def _draw_occupancy(
+    cells: torch.Tensor, board: Scoreboard, evaluator: Evaluator, world: World
+) -> Figure:
+    """Draw where the policies of the groups, and the pooled one, spend their steps."""
+    names = [group.name for group in evaluator.groups]
+    maps = {
+        f"set, catered to {name}": occupancy_map(board.episodes[board.label, name], cells)
+        for name in names
+    }
+    for pooled in ("pooled_cpl", "bradley_terry"):
+        if (pooled, names[0]) in board.episodes:
+            maps[method_name(pooled)] = occupancy_map(board.episodes[pooled, names[0]], cells)
+    return plots.occupancy(
+        picture(world),
+        maps,
+        suptitle="Where the policies go",
+        caption="Each rater group gets its own policy from the set; pooled CPL is one policy "
+        "for everybody.",
+    )
 
 
 def picture(world: World) -> NDArray[np.uint8] | None:

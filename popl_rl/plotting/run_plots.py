@@ -3,48 +3,27 @@
 Everything is drawn with Matplotlib's objects and nothing with pyplot: no global state, no windows.
 """
 
-import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 import pandas as pd
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import ListedColormap, Normalize, PowerNorm
+from matplotlib.colors import ListedColormap, PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 from numpy.typing import ArrayLike, NDArray
 
-from popl_rl.evaluation.method_names import METHODS, method_name
 from popl_rl.evaluation.statistics import require_columns
-from popl_rl.plotting.style import LEGEND, MEMBER_COLOURS, PALETTE, headline, legend_beside, tidy
+from popl_rl.plotting.style import PALETTE, headline, legend_beside, tidy
 
 __all__ = [
-    "METHODS",
     "learning_curves",
-    "members",
-    "method_name",
     "occupancy",
-    "recovery_bars",
     "selection",
 ]
-
-
-_METHOD_COLOURS = {
-    "popl": PALETTE["blue"],
-    "popl_lexicase": PALETTE["sky"],
-    **dict.fromkeys(("multi_cpl", "em", "vpl"), PALETTE["blue"]),
-    **dict.fromkeys(("multi_cpl_lexicase", "em_lexicase", "vpl_lexicase"), PALETTE["sky"]),
-    "cpl": PALETTE["orange"],
-    "bradley_terry": PALETTE["orange"],
-    "oracle": PALETTE["black"],
-    "random": PALETTE["grey"],
-}
-_OTHERS = (PALETTE["green"], PALETTE["purple"], PALETTE["vermilion"])
 
 
 def occupancy(
@@ -118,145 +97,6 @@ def _shares(title: str, visits: ArrayLike) -> NDArray[np.float64]:
     return table / (table.sum() or 1)
 
 
-def members(
-    accuracy: ArrayLike,
-    generations: Sequence[int],
-    group_names: Sequence[str],
-    *,
-    catered: Mapping[str, int],
-    pooled: ArrayLike | None = None,
-    oracle: Mapping[str, ArrayLike] | None = None,
-) -> Figure:
-    """How the population spreads over what the groups want.
-
-    Args:
-        accuracy: Share of each group's held-out pairs that each member ranks as that group does,
-            ``[generation, member, group]``.
-        generations: Generation of each slice of ``accuracy``.
-        group_names: Names of the G groups, at least 2.
-        catered: Group name -> member of the last generation that its raters are given.
-        pooled: Accuracies of the policy that was trained on everybody's answers, ``[group]``.
-        oracle: Group name -> accuracies of the policy that was trained on that group's answers
-            alone, ``[group]``.
-
-    Returns:
-        A panel for each pair of groups, at most 6: a dot for each member.
-
-    Raises:
-        ValueError: If the shapes or the group names do not fit together.
-    """
-    values = np.asarray(accuracy, dtype=np.float64)
-    expected = (len(generations), len(group_names))
-    if values.ndim != 3 or (values.shape[0], values.shape[2]) != expected or expected[1] < 2:
-        raise ValueError(
-            "accuracy must be [generation, member, group] for "
-            f"{len(generations)} generations and {len(group_names)} groups (at least 2), got shape "
-            f"{values.shape}"
-        )
-    unknown = [name for name in [*catered, *(oracle or {})] if name not in group_names]
-    if unknown:
-        raise ValueError(f"catered and oracle must name groups of {group_names}, got {unknown}")
-    marks = [*_marks(values[-1], group_names, catered, pooled, oracle or {})]
-    points = np.concatenate([values.reshape(-1, expected[1]), *(m.point[None] for m in marks)])
-    low, high = np.nanmin(points), np.nanmax(points)
-    low, high = low - 0.06 * max(high - low, 0.1), high + 0.16 * max(high - low, 0.1)
-    pairs = list(itertools.combinations(range(len(group_names)), 2))[:6]
-    columns = min(len(pairs), 3)
-    lines = math.ceil(len(pairs) / columns)
-    size = 5.0 if len(pairs) == 1 else 3.0
-    width = size * columns + 1.6
-    fig = Figure(figsize=(width, (size - 0.35) * lines + 1.7))
-    headline(
-        fig,
-        "Does every group find a policy of its own?",
-        "Each dot is a member of the population: how often it ranks unseen pairs as a group does.\n"
-        "Dotted lines: guessing.",
-    )
-    axes = fig.subplots(lines, columns, squeeze=False)
-    norm = Normalize(min(*generations, max(generations) - 1), max(generations))
-    colours = ListedColormap(colormaps["Greys"](np.linspace(0.22, 0.85, 256)))
-    for ax in axes.flat[len(pairs) :]:
-        ax.set_axis_off()
-    shown = {}
-    for ax, (x, y) in zip(axes.flat, pairs, strict=False):
-        for generation, slice_ in zip(generations, values, strict=True):
-            colour = colours(norm(generation))
-            ax.scatter(slice_[:, x], slice_[:, y], s=14, color=colour, linewidths=0)
-        for mark in marks:
-            if mark.group in (None, x, y):
-                shown[mark.label] = ax.scatter(
-                    mark.point[x], mark.point[y], label=mark.label, **mark.style
-                )
-        ax.axhline(0.5, color=PALETTE["grey"], linewidth=0.8, linestyle=":")
-        ax.axvline(0.5, color=PALETTE["grey"], linewidth=0.8, linestyle=":")
-        ax.set(
-            xlabel=f"agrees with “{group_names[x]}”",
-            ylabel=f"agrees with “{group_names[y]}”",
-            xlim=(low, high),
-            ylim=(low, high),
-            aspect="equal",
-        )
-        _corner(ax, f"only “{group_names[y]}”", 0.02, "left")
-        _corner(ax, "suits both", 0.98, "right")
-        for axis in (ax.xaxis, ax.yaxis):
-            axis.set_major_formatter(PercentFormatter(1, decimals=0))
-        tidy(ax)
-    if len(generations) > 1:
-        ticks = MaxNLocator(5, integer=True)
-        bar = fig.colorbar(ScalarMappable(norm, colours), ax=axes, shrink=0.6, ticks=ticks)
-        bar.set_label("generation of a member")
-    if shown:
-        labels = [mark.label for mark in marks if mark.label in shown]
-        # Two rows, filled column by column, keep what belongs to a group together.
-        ncols = min(math.ceil(len(labels) / 2), int(width / 2.1))
-        handles = [shown[label] for label in labels]
-        fig.legend(handles, labels, loc="outside lower left", ncols=ncols, **LEGEND)
-    return fig
-
-
-@dataclass(frozen=True)
-class _Mark:
-    """A policy to point out; ``group`` None where it belongs to all."""
-
-    label: str
-    point: NDArray[np.float64]
-    group: int | None
-    style: dict[str, Any]
-
-
-def _marks(
-    last: NDArray[np.float64],
-    group_names: Sequence[str],
-    catered: Mapping[str, int],
-    pooled: ArrayLike | None,
-    oracle: Mapping[str, ArrayLike],
-) -> Iterator[_Mark]:
-    for index, (name, colour) in enumerate(zip(group_names, itertools.cycle(MEMBER_COLOURS))):
-        if name in catered:
-            ring = {"s": 110, "facecolors": "none", "edgecolors": colour, "linewidths": 2.2}
-            yield _Mark(f"POPL for “{name}”", last[catered[name]], index, ring)
-        if name in oracle:
-            star = {"s": 120, "marker": "*", "color": colour}
-            yield _Mark(f"oracle of “{name}”", np.asarray(oracle[name], float), index, star)
-    if pooled is not None:
-        cross = {"s": 80, "marker": "X", "color": PALETTE["orange"], "edgecolors": "black"}
-        yield _Mark("one policy for everybody", np.asarray(pooled, float), None, cross)
-
-
-def _corner(ax: Axes, text: str, x: float, side: str) -> None:
-    ax.text(
-        x,
-        0.985,
-        text,
-        transform=ax.transAxes,
-        ha=side,
-        va="top",
-        fontsize=8,
-        style="italic",
-        color=PALETTE["grey"],
-    )
-
-
 def learning_curves(metrics: pd.DataFrame) -> Figure:
     """How well the population serves the raters, generation by generation.
 
@@ -317,87 +157,6 @@ def selection(metrics: pd.DataFrame) -> Figure:
     for ax in (top, bottom):
         ax.set_ylim(bottom=0)
     return fig
-
-
-def recovery_bars(results: pd.DataFrame, *, floor: str = "random actions") -> Figure:
-    """How much of an oracle's return each group gets from each method.
-
-    Args:
-        results: Tidy rows ``method, group, measure, value``; those of measure ``recovery`` are
-            drawn. Several rows of a method and group, such as seeds, are averaged and dotted.
-        floor: What a recovery of 0 is.
-
-    Raises:
-        ValueError: If a column is missing, or no row of measure ``recovery`` holds a number.
-    """
-    require_columns(results, ["method", "group", "measure", "value"])
-    rows = results[(results["measure"] == "recovery") & results["value"].notna()]
-    # By definition 1 and 0 for every group; lines show them.
-    rows = rows[~rows["method"].isin(["oracle", "random"])]
-    if rows.empty:
-        raise ValueError(
-            "results must hold rows of measure 'recovery' of a method other than oracle and "
-            f"random, got measures {sorted(results['measure'].unique())}; run the baselines too"
-        )
-    found = list(rows["method"].unique())
-    methods = [m for m in METHODS if m in found] + [m for m in found if m not in METHODS]
-    groups = list(rows["group"].unique())
-    low = -0.5 if rows["value"].min() < 0 else 0.0
-    high = 1.25
-    fig = Figure(figsize=(max(4.0, len(groups) * (0.5 * len(methods) + 0.4)) + 2.6, 4.2))
-    headline(
-        fig,
-        "How well is each group served?",
-        "Recovery: (return − floor) / (oracle's return − floor), in the group's own utility.",
-    )
-    ax = fig.subplots()
-    width = 0.8 / len(methods)
-    others = itertools.cycle(_OTHERS)
-    for index, method in enumerate(methods):
-        colour = _METHOD_COLOURS.get(method) or next(others)
-        label = method_name(method)
-        for place, group in enumerate(groups):
-            chosen = (rows["method"] == method) & (rows["group"] == group)
-            values = rows.loc[chosen, "value"].to_numpy(dtype=float)
-            if not len(values):
-                continue
-            x = place + (index - (len(methods) - 1) / 2) * width
-            mean = values.mean()
-            ax.bar(x, np.clip(mean, low, high), 0.92 * width, color=colour, label=label)
-            label = "_" + label  # one entry in the legend is enough
-            if len(values) > 1:
-                spread = x + np.linspace(-0.25, 0.25, len(values)) * width
-                ax.scatter(spread, values, s=12, color="white", edgecolors="black", zorder=3)
-            _value(ax, x, mean, values, low, high)
-    ax.axhline(1, color="black", linewidth=1, linestyle="--", zorder=0)
-    ax.axhline(0, color="black", linewidth=1)
-    legend_beside(ax, "as good as the oracle", 1, "black")
-    legend_beside(ax, f"as good as\n{floor}", 0, "black")
-    ax.set_xticks(range(len(groups)), [f"“{group}”" for group in groups])
-    ax.tick_params(axis="x", length=0)
-    ax.set(xlabel="raters who want", ylabel="recovery", ylim=(low and low - 0.2, high + 0.15))
-    fig.legend(loc="outside lower center", ncols=min(len(methods), 3), **LEGEND)
-    tidy(ax)
-    return fig
-
-
-def _value(
-    ax: Axes, x: float, mean: float, values: NDArray[np.float64], low: float, high: float
-) -> None:
-    """Write a bar's value beyond its end, with an arrow where the bar is cut off."""
-    up = mean >= 0
-    end = float(np.clip(values.max() if up else values.min(), low, high))
-    arrow = " ↑" if mean > high else " ↓" if mean < low else ""
-    ax.annotate(
-        f"{mean:.2f}{arrow}".replace("-", "−"),
-        (x, end),
-        xytext=(0, 5 if up else -5),
-        textcoords="offset points",
-        ha="center",
-        va="bottom" if up else "top",
-        fontsize=8,
-        bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6},
-    )
 
 
 def _line(ax: Axes, metrics: pd.DataFrame, column: str, label: str, colour: str) -> None:

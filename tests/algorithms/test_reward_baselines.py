@@ -59,12 +59,14 @@ def test_rivals_score_every_segment(spec, bank, comparisons, generator):
     )
     scores = reward_baselines.scores(bank)
     assert sorted(scores) == [
-        "dpl_categorical",
-        "dpl_categorical_risk_averse",
-        "dpl_mean_variance",
-        "dpl_mean_variance_risk_averse",
+        ("dpl_categorical", "expectation"),
+        ("dpl_categorical", "risk_averse"),
+        ("dpl_mean_variance", "expectation"),
+        ("dpl_mean_variance", "risk_averse"),
     ]
     for score in scores.values():
         assert score.shape == (len(bank),)
         assert score.isfinite().all()
-    assert (scores["dpl_mean_variance_risk_averse"] < scores["dpl_mean_variance"]).all()
+    assert (
+        scores["dpl_mean_variance", "risk_averse"] < scores["dpl_mean_variance", "expectation"]
+    ).all()

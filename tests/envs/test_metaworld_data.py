@@ -87,7 +87,7 @@ def test_a_run_from_segments_to_animations(config_of, tmp_path, monkeypatch):
     result = run(config_of(*overrides, f"run_dir={tmp_path / 'run'}"))
     table = result.board.results
     assert {"fast", "gentle"} <= set(table.group)
-    assert {"popl", "cpl", "oracle", "clone", "random"} <= set(table.method)
+    assert {"popl", "pooled_cpl", "oracle", "clone", "random"} <= set(table.method)
     assert table[table.measure == "return"].value.notna().all()
     speeds = table[table.measure.isin(["mean_hand_speed", "peak_hand_speed"])]
     assert len(speeds) >= 20

@@ -10,6 +10,7 @@ from popl_rl.evaluation.acting import Rolling
 from popl_rl.evaluation.diagnostics import alarm
 from popl_rl.evaluation.evaluator import Evaluator
 from popl_rl.evaluation.measures import group_returns
+from popl_rl.evaluation.statistics import RESULT_COLUMNS, rows_of
 from popl_rl.experiments.builders import build_groups
 from popl_rl.models.hypothesis_set import Catered
 from popl_rl.models.policies import PolicySpec
@@ -71,7 +72,7 @@ def test_every_group_finds_its_own_policy(evaluator, policies, baselines):
         assert board.value("popl", group, "accuracy") > 0.75
         # The set's accuracy for a group is that of the member it was given; the pooled policy
         # finds all segments equal, and a tie is not right.
-        assert board.value("cpl", group, "accuracy") == 0
+        assert board.value("pooled_cpl", group, "accuracy") == 0
         best, catered = (board.value("popl", group, m) for m in ("best_accuracy", "accuracy"))
         assert best >= catered
 
@@ -82,7 +83,8 @@ def test_rows_and_episodes_are_called_as_asked(evaluator, policies, baselines):
         evaluator.score(policies, baselines, label="em"),
     )
     assert (board.label, other.label) == ("popl", "em")
-    assert set(other.results.method) == {"em", "em_lexicase", "cpl", "oracle", "random"}
+    assert set(other.results.method) == {"em", "pooled_cpl", "oracle", "random"}
+    assert set(other.results.choice[other.results.method == "em"]) == {"", "posterior", "lexicase"}
     assert other.results.value.equals(board.results.value)
     assert ("em", "likes_left") in other.episodes
     assert other.catered == board.catered
@@ -90,13 +92,14 @@ def test_rows_and_episodes_are_called_as_asked(evaluator, policies, baselines):
 
 def test_the_table_is_complete_and_tidy(evaluator, policies, baselines):
     results = evaluator.score(policies, baselines).results
-    assert list(results.columns) == ["method", "group", "measure", "value"]
-    assert not results.duplicated(["method", "group", "measure"]).any()
-    methods = {"popl", "popl_lexicase", "cpl", "oracle"}
-    assert set(results.method) == {*methods, "random"}
-    for method in methods:
+    assert list(results.columns) == RESULT_COLUMNS
+    assert not results.duplicated(RESULT_COLUMNS[:-1]).any()
+    assert set(results.method) == {"popl", "pooled_cpl", "oracle", "random"}
+    assert set(results.choice[results.method != "popl"]) == {""}
+    found = [("popl", "posterior"), ("popl", "lexicase"), ("pooled_cpl", ""), ("oracle", "")]
+    for entry in found:
         for group in ("likes_left", "likes_right"):
-            rows = results[(results.method == method) & (results.group == group)]
+            rows = rows_of(results[results.group == group], *entry)
             assert set(rows.measure) >= MEASURES
     assert results.value.notna().all()
 
@@ -128,7 +131,7 @@ def test_a_set_of_one_gives_everyone_that_one(evaluator, baselines):
 
 def test_without_baselines_there_is_no_recovery(evaluator, policies):
     board = evaluator.score(policies, None)
-    assert set(board.results.method) == {"popl", "popl_lexicase", "random"}
+    assert set(board.results.method) == {"popl", "random"}
     for method in ("popl", "random"):
         assert math.isnan(board.value(method, "likes_left", "recovery"))
         assert math.isfinite(board.value(method, "likes_left", "return"))
@@ -143,7 +146,7 @@ def test_episodes_for_the_pictures(evaluator, policies, baselines):
     episodes = evaluator.score(policies, baselines).episodes
     assert set(episodes) == {
         (method, group)
-        for method in ("popl", "cpl", "oracle")
+        for method in ("popl", "pooled_cpl", "oracle")
         for group in ("likes_left", "likes_right")
     }
     assert all(rolled.batch_size == (1, 6, 8) for rolled in episodes.values())
@@ -192,8 +195,8 @@ def curious(evaluator):
     )
 
 
-def values(board, method, group):
-    rows = board.results[(board.results.method == method) & (board.results.group == group)]
+def values(board, method, group, choice=""):
+    rows = rows_of(board.results[board.results.group == group], method, choice)
     return rows.set_index("measure").value.to_dict()
 
 
@@ -223,10 +226,9 @@ def test_curves_by_hand(curious, policies, baselines):
     low = group_returns(curious.acting(None), curious.groups)[0]
     high = group_returns(curious.acting(baselines)[1:], curious.groups).diagonal()
     for method in ("posterior", "lexicase"):
-        name = "popl" if method == "posterior" else "popl_lexicase"
         picks = curious.cater(policies, method, answers=1)
         for index, group in enumerate(curious.groups):
-            found = values(board, name, group.name)
+            found = values(board, "popl", group.name, method)
             expected = float(accuracy[picks[index], index].mean())
             assert found["accuracy@1"] == pytest.approx(expected)
             mean = float(returns[picks[index], index].mean())
@@ -258,7 +260,7 @@ def test_members_are_rolled_once_and_no_more_than_allowed(curious, baselines, mo
     curious.config.curve_members = always + 1
     board = curious.score(policies, baselines)
     assert rolled == [0, 3, always + 1], "random actions, baselines, and the set, each in one go"
-    found = values(board, "popl", "likes_left")
+    found = values(board, "popl", "likes_left", "posterior")
     assert {"recovery@10", "recovery@25"} <= set(found)
     assert "recovery@1" not in found
     assert "accuracy@1" in found, "which takes no rollouts"
@@ -282,16 +284,36 @@ def test_the_set_as_a_whole(evaluator, baselines):
     board = evaluator.score(walkers(9.0), baselines)
     found = values(board, "popl", "all")
     worst = board.value("popl", "likes_left", "recovery")
-    assert found["worst_recovery"] == worst < 0
-    assert found["coverage"] == 0.5
+    given = values(board, "popl", "all", "posterior")
+    assert given["worst_recovery"] == worst < 0
+    assert given["coverage"] == 0.5
     assert found["fair_recovery"] == pytest.approx(worst, abs=1e-6)
     assert found["distinct"] == found["favourite_share"] == 1
     assert found["effective"] == pytest.approx(1)
     assert found["gain"] == found["gain_error"] == 0
     assert found["further_accuracy"] == found["one_for_all_accuracy"]
     assert 0 <= found["fair_worst_rater"] <= found["fair_quantile"] < 0.5
-    assert values(board, "oracle", "all") == {"worst_recovery": 1, "coverage": 1}
-    assert values(board, "cpl", "all")["coverage"] == 0
+    oracle = values(board, "oracle", "all")
+    assert (oracle["worst_recovery"], oracle["coverage"]) == (1, 1)
+    assert values(board, "pooled_cpl", "all")["coverage"] == 0
+
+
+def test_shares_of_the_optimum_by_hand(evaluator, baselines):
+    """Walkers that hardly ever err are at the optimum; the pooled policy is random here."""
+    board = evaluator.score(walkers(30.0, -30.0), baselines)
+    for group in ("likes_left", "likes_right"):
+        for measure in ("share_of_optimum", "best_share_of_optimum", "accurate_share_of_optimum"):
+            assert board.value("popl", group, measure) == pytest.approx(1)
+        assert board.value("pooled_cpl", group, "share_of_optimum") == pytest.approx(0)
+        assert board.value("random", group, "share_of_optimum") == 0
+        assert 0.9 < board.value("oracle", group, "share_of_optimum") < 1
+    lopsided = evaluator.score(walkers(30.0), baselines)
+    for measure in ("worst_share_of_optimum", "fair_share_of_optimum"):
+        assert lopsided.value("popl", "all", measure) == pytest.approx(-1)
+    rows = board.results[board.results.measure == "worst_share_of_optimum"]
+    found = set(zip(rows.method, rows.choice, strict=True))
+    catered = {("popl", "posterior"), ("popl", "lexicase")}
+    assert found == catered | {("pooled_cpl", ""), ("oracle", ""), ("random", "")}
 
 
 def test_the_alarm_hears_a_collapse_and_no_healthy_set(evaluator, policies, baselines):

@@ -4,13 +4,8 @@ import math
 import pandas as pd
 import pytest
 
-from popl_rl.experiments.benchmark_report import (
-    catering_table,
-    markdown,
-    recovery_table,
-    stands_out,
-    write_report,
-)
+from popl_rl.experiments.benchmark_report import benchmark_markdown, write_report
+from popl_rl.experiments.benchmark_tables import catering_table, recovery_table, stands_out
 from popl_rl.experiments.cells import COLUMNS, plan
 from popl_rl.experiments.suites import parse_suite
 
@@ -29,15 +24,22 @@ SUITE = parse_suite(
 
 
 def table(*rows):
-    """Rows of scenario, method, group, measure, and a value for each seed."""
+    """Rows of scenario, method (and choice), group, measure, and a value for each seed."""
     return pd.DataFrame(
         [
-            ("mine", scenario, seed, method, group, measure, value)
+            ("mine", scenario, seed, *entry(method), group, measure, value)
             for scenario, method, group, measure, values in rows
             for seed, value in enumerate(values)
         ],
         columns=COLUMNS,
     )
+
+
+def entry(method):
+    """Method and choice; catered by the posterior if it is the suite's and nothing is said."""
+    if isinstance(method, tuple):
+        return method
+    return method, "posterior" if method in SUITE.methods else ""
 
 
 def recoveries(scenario, method, values):
@@ -51,7 +53,7 @@ def lines(text):
 def test_the_recovery_of_the_worst_group_by_scenario_and_method():
     """Standard error of 0.8, 0.9, 1.0 is 0.1 / sqrt(3); times 4.303 (t, two degrees): 0.25."""
     results = table(
-        recoveries("plain", "cpl", [0.1, 0.2, 0.3]),
+        recoveries("plain", "pooled_cpl", [0.1, 0.2, 0.3]),
         recoveries("plain", "popl", [0.8, 0.9, 1.0]),
         ("plain", "popl", "lower", "recovery", [1.1, 1.1, 1.1]),
         recoveries("plain", "oracle", [1, 1, 1]),
@@ -68,7 +70,7 @@ def test_the_recovery_of_the_worst_group_by_scenario_and_method():
 
 def test_seeds_without_a_recovery_are_counted():
     results = table(
-        recoveries("plain", "popl", [0.8, 0.8]), recoveries("plain", "cpl", [0.5, math.nan])
+        recoveries("plain", "popl", [0.8, 0.8]), recoveries("plain", "pooled_cpl", [0.5, math.nan])
     )
     assert recovery_table(SUITE, results)[1] == [
         ["plain", "0.80 ± 0.00 [0.80]", "0.50 (1 of 2 seeds)"]
@@ -94,7 +96,7 @@ def test_the_best_stands_out_where_its_interval_is_apart_from_all_others(interva
 def test_a_method_need_not_stand_out_from_its_own_other_catering():
     results = table(
         recoveries("plain", "popl", [0.92, 0.94]),
-        recoveries("plain", "popl_lexicase", [0.91, 0.91]),
+        recoveries("plain", ("popl", "lexicase"), [0.91, 0.91]),
         recoveries("plain", "other", [0.30, 0.31]),
     )
     _, [row] = recovery_table(SUITE, results)
@@ -104,8 +106,8 @@ def test_a_method_need_not_stand_out_from_its_own_other_catering():
 RESULTS = table(
     ("plain", "popl", "upper", "accuracy", [0.90, 0.92]),
     ("plain", "popl", "upper", "best_accuracy", [0.95, 0.95]),
-    ("plain", "popl_lexicase", "upper", "accuracy", [0.5, 0.5]),
-    ("plain", "popl_lexicase", "upper", "best_accuracy", [0.95, 0.95]),
+    ("plain", ("popl", "lexicase"), "upper", "accuracy", [0.5, 0.5]),
+    ("plain", ("popl", "lexicase"), "upper", "best_accuracy", [0.95, 0.95]),
     ("plain", "oracle", "upper", "accuracy", [0.98, 0.98]),
     ("plain", "oracle", "upper", "best_accuracy", [0.98, 0.98]),
     ("plain", "popl", "all", "seconds", [10.0, 20.0]),
@@ -117,7 +119,7 @@ RESULTS = table(
 
 def test_accuracies_by_scenario_and_along_each_axis():
     """Two seeds 0.02 apart: half-width 12.706 * 0.01 (t, one degree) = 12.7 percent."""
-    text = markdown(SUITE, RESULTS, about={"seeds": 2}, missing={}, figures=[])
+    text = benchmark_markdown(SUITE, RESULTS, about={"seeds": 2}, missing={}, figures=[])
     rows = lines(text)
     assert "| seeds | 2 |" in rows
     head = "| scenario | raters who want | popl | popl, by lexicase | oracle (told the groups) |"
@@ -139,12 +141,12 @@ def test_the_report_has_a_row_for_each_method_and_a_column_for_each_scenario_off
     """Two seeds 0.02 apart: half-width 12.706 * 0.01 (t, one degree) = 0.13."""
     results = table(
         recoveries("plain", "popl", [0.90, 0.92]),
-        recoveries("plain", "cpl", [0.1, 0.1]),
+        recoveries("plain", "pooled_cpl", [0.1, 0.1]),
         recoveries("base", "popl", [0.9]),
         recoveries("noisy", "popl", [0.8]),
         recoveries("noisy", "other", [0.7]),
     )
-    rows = lines(markdown(SUITE, results, about={}, missing={}, figures=[]))
+    rows = lines(benchmark_markdown(SUITE, results, about={}, missing={}, figures=[]))
     start = rows.index("| method | plain |")
     assert rows[start + 1 : start + 3] == [
         "| popl | **0.91 ± 0.13 [0.90]** |",
@@ -170,7 +172,7 @@ def test_what_a_set_holds_and_how_much_of_it_is_found():
         ("plain", "popl", "all", "effective", [2.0, 2.0]),
         ("plain", "popl", "all", "fair_worst_rater", [0.2, 0.2]),
         ("plain", "popl", "all", "fair_quantile", [0.4, 0.4]),
-        ("plain", "cpl", "upper", "recovery", [0.1, 0.1]),
+        ("plain", "pooled_cpl", "upper", "recovery", [0.1, 0.1]),
         ("plain", "other", "upper", "best_recovery", [0.5]),
     )
     head, rows = catering_table(SUITE, results)
@@ -203,7 +205,7 @@ def test_axes_of_many_groups_are_told_by_recovery_alone(tmp_path):
 
 def test_what_is_missing_is_said_on_a_line_each():
     missing = {"plain/popl/seed0": "two\n  lines", "plain/popl/seed1": "not run yet"}
-    text = markdown(SUITE, RESULTS, about={"seeds": 2}, missing=missing, figures=[])
+    text = benchmark_markdown(SUITE, RESULTS, about={"seeds": 2}, missing=missing, figures=[])
     assert "## Missing cells: 2\n\n- plain/popl/seed0: two lines\n- plain/popl/seed1: not" in text
 
 

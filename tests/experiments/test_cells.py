@@ -3,7 +3,7 @@ import json
 import pandas as pd
 import pytest
 
-from popl_rl.evaluation.statistics import worst
+from popl_rl.evaluation.statistics import RESULT_COLUMNS, worst
 from popl_rl.experiments.cells import COLUMNS, claim, collect, is_finished, plan
 from popl_rl.experiments.suites import parse_suite
 
@@ -70,10 +70,12 @@ def test_seeds_are_counted():
 # Folders
 
 
-def finish(cell, run_dir, rows=(), seconds=1.5):
+def finish(cell, run_dir, rows=(), seconds=1.5, name="popl"):
+    """What a cell leaves whose configuration calls its method ``name``."""
     folder = cell.folder(run_dir)
     folder.mkdir(parents=True)
-    table = pd.DataFrame(rows, columns=["method", "group", "measure", "value"])
+    table = pd.DataFrame(rows, columns=RESULT_COLUMNS)
+    (folder / "config.yaml").write_text(f"method: {{name: {name}}}")
     table.to_csv(folder / "results.csv", index=False)
     (folder / "cell.json").write_text(json.dumps({**cell.record(), "seconds": seconds}))
 
@@ -138,10 +140,14 @@ def test_a_folder_belongs_to_one_suite(tmp_path):
 def found(recovery, *, oracle=1.0):
     """What a run writes: two groups, of which the second is served worse by 0.1."""
     rows = []
-    for method, value in (("popl", recovery), ("popl_lexicase", recovery / 2), ("oracle", oracle)):
-        rows.append((method, "upper", "recovery", value))
-        rows.append((method, "lower", "recovery", value - 0.1))
-    return [*rows, ("random", "upper", "return", 0.0)]
+    for entry, value in {
+        ("popl", "posterior"): recovery,
+        ("popl", "lexicase"): recovery / 2,
+        ("oracle", ""): oracle,
+    }.items():
+        rows.append((*entry, "upper", "recovery", value))
+        rows.append((*entry, "lower", "recovery", value - 0.1))
+    return [*rows, ("random", "", "upper", "return", 0.0)]
 
 
 def test_results_get_the_name_of_the_method_and_others_come_from_the_first(tmp_path):
@@ -154,31 +160,40 @@ def test_results_get_the_name_of_the_method_and_others_come_from_the_first(tmp_p
     assert set(results.suite) == {"sweep"}
     assert set(results.seed) == {0}
     assert not results.duplicated(COLUMNS[:-1]).any()
-    of = results.set_index(["scenario", "method", "group", "measure"]).value.to_dict()
-    assert of["base", "popl", "upper", "recovery"] == 0.9
-    assert of["base", "mine", "upper", "recovery"] == 0.5
-    assert of["base", "mine_lexicase", "upper", "recovery"] == 0.25
-    assert of["base", "oracle", "upper", "recovery"] == 1.0, "not the 7 of the second method"
-    assert of["few", "mine", "upper", "recovery"] == 0.4
-    assert of["few", "oracle", "upper", "recovery"] == 0.8
-    assert of["base", "popl", "all", "seconds"] == 1.5
-    assert ("base", "mine", "all", "seconds") not in of, "its time is unknown"
+    of = results.set_index(["scenario", "method", "choice", "group", "measure"]).value.to_dict()
+    assert of["base", "popl", "posterior", "upper", "recovery"] == 0.9
+    assert of["base", "mine", "posterior", "upper", "recovery"] == 0.5
+    assert of["base", "mine", "lexicase", "upper", "recovery"] == 0.25
+    assert of["base", "oracle", "", "upper", "recovery"] == 1.0, "not the 7 of the second method"
+    assert of["few", "mine", "posterior", "upper", "recovery"] == 0.4
+    assert of["few", "oracle", "", "upper", "recovery"] == 0.8
+    assert of["base", "popl", "", "all", "seconds"] == 1.5
+    assert ("base", "mine", "", "all", "seconds") not in of, "its time is unknown"
     assert len(of) == 8 + 4 + 8
     assert results.scenario.unique().tolist() == ["few", "base"], "in the suite's order"
     assert noisy_popl.scenario not in set(results.scenario), "it is not finished"
 
 
-@pytest.mark.parametrize("label", ["multi_cpl", "em", "vpl"])
+@pytest.mark.parametrize("label", ["cpl", "em", "mine_too"])
 def test_what_a_cell_trained_gets_the_methods_name_whatever_it_is(tmp_path, label):
-    """Its rows are not those of the first cell, and ``cpl`` stays the baseline's."""
+    """Its rows are not those of the first cell, and those of baselines stay the baselines'."""
     suite = parse_suite("s", {"methods": {"popl": [], "mine": []}, "scenarios": {"a": []}})
     first, second = plan(suite, seeds=1)
-    finish(first, tmp_path, [("popl", "g", "accuracy", 0.9), ("cpl", "g", "accuracy", 0.6)])
-    own = [(label, "g", "accuracy", 0.7), (f"{label}_lexicase", "g", "accuracy", 0.5)]
-    finish(second, tmp_path, [*own, ("cpl", "g", "accuracy", 0.1)])
+    finish(
+        first,
+        tmp_path,
+        [("popl", "posterior", "g", "accuracy", 0.9), ("pooled_cpl", "", "g", "accuracy", 0.6)],
+    )
+    own = [(label, "posterior", "g", "accuracy", 0.7), (label, "lexicase", "g", "accuracy", 0.5)]
+    finish(second, tmp_path, [*own, ("pooled_cpl", "", "g", "accuracy", 0.1)], name=label)
     results = collect(suite, [first, second], tmp_path)
-    of = results[results.measure == "accuracy"].set_index("method").value.to_dict()
-    assert of == {"popl": 0.9, "cpl": 0.6, "mine": 0.7, "mine_lexicase": 0.5}
+    of = results[results.measure == "accuracy"].set_index(["method", "choice"])
+    assert of.value.to_dict() == {
+        ("popl", "posterior"): 0.9,
+        ("pooled_cpl", ""): 0.6,
+        ("mine", "posterior"): 0.7,
+        ("mine", "lexicase"): 0.5,
+    }
 
 
 def test_nothing_is_finished(tmp_path):
@@ -191,8 +206,8 @@ def test_nothing_is_finished(tmp_path):
 def test_a_method_may_not_have_the_name_of_a_row_of_another(tmp_path):
     suite = parse_suite("s", {"methods": {"popl": [], "dpl": []}, "scenarios": {"a": []}})
     first, second = plan(suite, seeds=1)
-    finish(first, tmp_path, [("popl", "g", "accuracy", 1.0), ("dpl", "g", "accuracy", 0.5)])
-    finish(second, tmp_path, [("popl", "g", "accuracy", 1.0)])
+    finish(first, tmp_path, [("popl", "", "g", "accuracy", 1.0), ("dpl", "", "g", "accuracy", 0.5)])
+    finish(second, tmp_path, [("popl", "", "g", "accuracy", 1.0)])
     with pytest.raises(ValueError, match="rows of method 'dpl' in scenario 'a'; give the suite's"):
         collect(suite, [first, second], tmp_path)
 
@@ -202,6 +217,8 @@ def test_the_worst_group_of_each_run_counts(tmp_path):
     for cell, recovery in zip((cells[0], cells[5]), (0.9, 0.7), strict=True):
         finish(cell, tmp_path, found(recovery))
     table = worst(collect(SUITE, cells, tmp_path))
-    assert table.method.unique().tolist() == ["popl", "popl_lexicase"]
-    assert table[table.method == "popl"].value.tolist() == pytest.approx([0.8, 0.6])
-    assert table[table.method == "popl"].seed.tolist() == [0, 1]
+    assert table.method.unique().tolist() == ["popl"]
+    assert set(table.choice) == {"posterior", "lexicase"}
+    given = table[table.choice == "posterior"]
+    assert given.value.tolist() == pytest.approx([0.8, 0.6])
+    assert given.seed.tolist() == [0, 1]

@@ -5,24 +5,24 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from popl_rl.evaluation.statistics import summary, worst_recovery
+from popl_rl.evaluation.statistics import RESULT_COLUMNS, summary, worst_group
 from popl_rl.experiments.report import markdown, results_table
 
 RESULTS = pd.DataFrame(
     [
-        ("random", "upper", "return", -5.0),
-        ("cpl", "upper", "recovery", 0.97),
-        ("cpl", "lower", "recovery", 0.3),
-        ("popl", "upper", "return", 4.5),
-        ("popl", "upper", "recovery", 0.95),
-        ("popl", "upper", "success", 0.987),
-        ("popl", "upper", "accuracy", 0.88),
-        ("popl", "upper", "door_0", 1.0),
-        ("popl", "lower", "recovery", -0.001),
-        ("mine", "[red]", "accuracy", 0.5),
-        ("oracle", "upper", "recovery", 1.0),
+        ("random", "", "upper", "return", -5.0),
+        ("pooled_cpl", "", "upper", "recovery", 0.97),
+        ("pooled_cpl", "", "lower", "recovery", 0.3),
+        ("popl", "posterior", "upper", "return", 4.5),
+        ("popl", "posterior", "upper", "recovery", 0.95),
+        ("popl", "posterior", "upper", "success", 0.987),
+        ("popl", "posterior", "upper", "accuracy", 0.88),
+        ("popl", "posterior", "upper", "door_0", 1.0),
+        ("popl", "posterior", "lower", "recovery", -0.001),
+        ("mine", "", "[red]", "accuracy", 0.5),
+        ("oracle", "", "upper", "recovery", 1.0),
     ],
-    columns=["method", "group", "measure", "value"],
+    columns=RESULT_COLUMNS,
 )
 
 
@@ -49,18 +49,22 @@ def test_the_table_has_a_row_for_each_method_and_group() -> None:
 
 def test_several_runs_are_shown_with_their_interval() -> None:
     results = pd.DataFrame(
-        [("popl", "a", "recovery", value) for value in (0.8, 0.9, 1.0)]
-        + [("popl", "a", "success", value) for value in (0.5, float("nan"))],
-        columns=["method", "group", "measure", "value"],
+        [("popl", "posterior", "a", "recovery", value) for value in (0.8, 0.9, 1.0)]
+        + [("popl", "posterior", "a", "success", value) for value in (0.5, float("nan"))],
+        columns=RESULT_COLUMNS,
     )
     # Standard error 0.1 / sqrt(3), times the 97.5 % point of t with 2 degrees of freedom, 4.303.
     assert printed(results)[1] == ["POPL (catered)", "a", "–", "0.90 ± 0.25", "50 %", "–"]
 
 
 def test_the_worst_group_counts() -> None:
-    assert worst_recovery(RESULTS) == {"popl": -0.001, "cpl": 0.3, "oracle": 1.0}
+    assert worst_group(RESULTS) == {
+        ("popl", "posterior"): -0.001,
+        ("pooled_cpl", ""): 0.3,
+        ("oracle", ""): 1.0,
+    }
     unknown = RESULTS.assign(value=RESULTS["value"].where(RESULTS["group"] != "lower"))
-    assert worst_recovery(unknown) == {"oracle": 1.0}, "what is unknown in a group has no worst"
+    assert worst_group(unknown) == {("oracle", ""): 1.0}, "what is unknown in a group has no worst"
 
 
 def test_the_report_has_everything() -> None:
@@ -102,7 +106,7 @@ def test_a_missing_column_is_named() -> None:
     with pytest.raises(ValueError, match=r"\['group'\] are missing"):
         results_table(bad)
     with pytest.raises(ValueError, match=r"\['group'\] are missing"):
-        worst_recovery(bad)
+        worst_group(bad)
     with pytest.raises(ValueError, match=r"\['group'\] are missing"):
         markdown(bad, title="t", about={}, figures=[])
 
@@ -112,12 +116,12 @@ def test_a_summary_is_about_the_worst_group_of_each_run():
 
     def results(upper, lower, accuracy):
         rows = [
-            ("popl", "upper", "recovery", upper),
-            ("popl", "lower", "recovery", lower),
-            ("popl", "upper", "accuracy", accuracy),
-            ("oracle", "upper", "accuracy", 0.9),
+            ("popl", "posterior", "upper", "recovery", upper),
+            ("popl", "posterior", "lower", "recovery", lower),
+            ("popl", "posterior", "upper", "accuracy", accuracy),
+            ("oracle", "", "upper", "accuracy", 0.9),
         ]
-        return pd.DataFrame(rows, columns=["method", "group", "measure", "value"])
+        return pd.DataFrame(rows, columns=RESULT_COLUMNS)
 
     table = summary({"a": results(0.8, 1.0, 0.88), "b": results(0.9, 0.6, 0.85)})
     row = table.set_index("method").loc["popl"]

@@ -17,10 +17,15 @@ from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 from rich.console import Console
 
-import popl_rl.experiments.run_folder
 from popl_rl.experiments.loggers import Progress, make_logger
 from popl_rl.experiments.metrics import MetricsWriter
-from popl_rl.experiments.run_folder import create_run_dir, load_config, save_config, write_metadata
+from popl_rl.experiments.run_folder import (
+    create_run_dir,
+    git_state,
+    load_config,
+    save_config,
+    write_metadata,
+)
 from popl_rl.storage import write_atomic, write_json
 
 
@@ -152,12 +157,10 @@ def test_metadata_of_a_resumed_run_are_added(tmp_path: Path) -> None:
 def test_the_commit_is_none_outside_of_a_checkout(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert popl_rl.experiments.run_folder._git(tmp_path) is None
-    assert popl_rl.experiments.run_folder._git(Path(__file__).parent) is None, (
-        "not the top of its checkout"
-    )
+    assert git_state(tmp_path) is None
+    assert git_state(Path(__file__).parent) is None, "not the top of its checkout"
     monkeypatch.setenv("PATH", "")
-    assert popl_rl.experiments.run_folder._git(Path(__file__).parents[1]) is None, "no git"
+    assert git_state(Path(__file__).parents[1]) is None, "no git"
 
 
 def test_the_commit_and_changes_of_a_checkout_are_found(
@@ -171,15 +174,15 @@ def test_the_commit_and_changes_of_a_checkout_are_found(
         subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
     except FileNotFoundError:
         pytest.skip("needs git")
-    assert popl_rl.experiments.run_folder._git(tmp_path) is None, "no commit yet"
+    assert git_state(tmp_path) is None, "no commit yet"
     commit = ["commit", "-q", "--allow-empty", "-m", "m"]
     subprocess.run(["git", "-C", str(tmp_path), *commit], check=True)
-    clean = popl_rl.experiments.run_folder._git(tmp_path)
+    clean = git_state(tmp_path)
     assert clean is not None
     assert len(clean["commit"]) == 40
     assert clean["dirty"] is False
     (tmp_path / "new").touch()
-    assert popl_rl.experiments.run_folder._git(tmp_path) == {**clean, "dirty": True}
+    assert git_state(tmp_path) == {**clean, "dirty": True}
 
 
 def test_metrics_have_a_row_per_generation_and_fixed_columns(tmp_path: Path) -> None:

@@ -46,11 +46,13 @@ def test_scenarios_lie_on_axes_in_the_order_of_numbers_or_as_written():
 
 def test_methods_are_shown_in_the_suites_order_under_names_that_say_what_they_are():
     suite = parse_suite("sweep", SWEEP)
-    found = ["cpl", "mine_lexicase", "oracle", "mine", "popl"]
-    assert suite.ordered(found) == ["popl", "mine", "mine_lexicase", "cpl", "oracle"]
+    pooled, oracle = ("pooled_cpl", ""), ("oracle", "")
+    mine = [("mine", "posterior"), ("mine", "lexicase")]
+    found = [pooled, mine[1], oracle, mine[0], ("popl", "posterior")]
+    assert suite.ordered(found) == [("popl", "posterior"), *mine, pooled, oracle]
     assert suite.label("popl") == "popl"
-    assert suite.label("mine_lexicase") == "mine, by lexicase"
-    assert suite.label("cpl") == "CPL on everybody's answers"
+    assert suite.label("mine", "lexicase") == "mine, by lexicase"
+    assert suite.label("pooled_cpl") == "CPL on everybody's answers"
 
 
 def test_a_scenario_may_be_a_list():
@@ -87,8 +89,8 @@ def changed(**changes):
         ),
         (changed(methods={"oracle": []}), "methods.oracle has the name of other rows"),
         (
-            changed(methods={"popl_lexicase": [], "popl": []}),
-            "methods.popl_lexicase has the name of other rows",
+            changed(methods={"dpl_categorical": [], "popl": []}),
+            "methods.dpl_categorical has the name of other rows",
         ),
         (
             changed(scenarios={"a": {"overides": []}}),

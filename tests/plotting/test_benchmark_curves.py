@@ -24,15 +24,22 @@ SUITE = parse_suite(
 
 
 def table(*rows):
-    """Rows of scenario, method, group, measure, and a value for each seed."""
+    """Rows of scenario, method (and choice), group, measure, and a value for each seed."""
     return pd.DataFrame(
         [
-            ("mine", scenario, seed, method, group, measure, value)
+            ("mine", scenario, seed, *entry(method), group, measure, value)
             for scenario, method, group, measure, values in rows
             for seed, value in enumerate(values)
         ],
         columns=COLUMNS,
     )
+
+
+def entry(method):
+    """Method and choice; catered by the posterior if it is the suite's and nothing is said."""
+    if isinstance(method, tuple):
+        return method
+    return method, "posterior" if method in SUITE.methods else ""
 
 
 def curve_rows(scenario, method, values, best):
@@ -47,10 +54,10 @@ def curve_rows(scenario, method, values, best):
 
 CURVES = table(
     *curve_rows("plain", "popl", {1: 0.5, 10: 0.8, 100: 0.9}, 0.95),
-    *curve_rows("plain", "popl_lexicase", {1: 0.3, 10: 0.6}, None),
+    *curve_rows("plain", ("popl", "lexicase"), {1: 0.3, 10: 0.6}, None),
     *curve_rows("plain", "other", {10: -3.0}, -3.0),
     *curve_rows("odd", "popl", {1: 0.4}, 0.4),
-    ("plain", "cpl", "upper", "recovery", [0.1]),
+    ("plain", "pooled_cpl", "upper", "recovery", [0.1]),
 )
 
 
@@ -88,15 +95,16 @@ def test_curves_of_catering_and_the_best_in_hindsight():
 
 def test_curves_need_curves():
     with pytest.raises(ValueError, match="measures such as recovery@10, got none"):
-        catering_curves(SUITE, CURVES[CURVES.method == "cpl"])
+        catering_curves(SUITE, CURVES[CURVES.method == "pooled_cpl"])
 
 
 RECOVERIES = table(
     *(
         (scenario, method, "upper", "recovery", [value, value + 0.1])
         for scenario, value in (("plain", 0.6), ("small", 0.7), ("large", 0.8), ("wild", -2.0))
-        for method in ("popl", "popl_lexicase", "other", "cpl", "oracle")
-        if (scenario, method) not in (("wild", "other"), ("large", "cpl"), ("wild", "cpl"))
+        for method in ("popl", ("popl", "lexicase"), "other", "pooled_cpl", "oracle")
+        if (scenario, method)
+        not in (("wild", "other"), ("large", "pooled_cpl"), ("wild", "pooled_cpl"))
     )
 )
 

@@ -21,15 +21,22 @@ SUITE = parse_suite(
 
 
 def table(*rows):
-    """Rows of scenario, method, group, measure, and a value for each seed."""
+    """Rows of scenario, method (and choice), group, measure, and a value for each seed."""
     return pd.DataFrame(
         [
-            ("mine", scenario, seed, method, group, measure, value)
+            ("mine", scenario, seed, *entry(method), group, measure, value)
             for scenario, method, group, measure, values in rows
             for seed, value in enumerate(values)
         ],
         columns=COLUMNS,
     )
+
+
+def entry(method):
+    """Method and choice; catered by the posterior if it is the suite's and nothing is said."""
+    if isinstance(method, tuple):
+        return method
+    return method, "posterior" if method in SUITE.methods else ""
 
 
 def texts(fig):
@@ -48,8 +55,8 @@ def assert_nothing_overlaps_the_edge(fig):
 RECOVERIES = table(
     ("plain_one", "popl", "upper", "recovery", [0.8, 0.9, 1.0]),
     ("plain_one", "popl", "lower", "recovery", [1.0, 1.0, 1.0]),
-    ("plain_one", "popl_lexicase", "upper", "recovery", [0.7]),
-    ("plain_one", "cpl", "upper", "recovery", [-3.0, -3.0]),
+    ("plain_one", ("popl", "lexicase"), "upper", "recovery", [0.7]),
+    ("plain_one", "pooled_cpl", "upper", "recovery", [-3.0, -3.0]),
     ("plain_one", "oracle", "upper", "recovery", [1.0]),
     ("odd", "popl", "upper", "recovery", [0.5, np.nan]),
 )
@@ -83,7 +90,7 @@ ACCURACIES = table(
     *(
         (scenario, method, group, measure, [value, value + 0.1])
         for scenario, value in (("plain_one", 0.6), ("large", 0.7), ("odd", 0.8))
-        for method in ("popl", "other", "popl_lexicase", "oracle", "bradley_terry", "brex")
+        for method in ("popl", "other", ("popl", "lexicase"), "oracle", "bradley_terry", "brex")
         for group in ("upper", "lower")
         for measure in ("accuracy", "best_accuracy")
         if (scenario, method)

@@ -1,3 +1,4 @@
+import inspect
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from popl_rl.plotting import run_plots as plots
 from popl_rl.plotting import style as plot_style
+from popl_rl.plotting.member_plots import members
 
 PNG = b"\x89PNG\r\n"
 
@@ -56,7 +57,7 @@ def test_a_figure_is_saved_as_a_png_of_120_dots_per_inch(tmp_path: Path) -> None
 
 
 def test_pyplot_is_not_used() -> None:
-    source = Path(plots.__file__).read_text()
+    source = inspect.getsource(inspect.getmodule(plots.learning_curves))
     assert "import matplotlib.pyplot" not in source
     assert "rcParams" not in source
     before = dict(mpl.rcParams)
@@ -156,7 +157,7 @@ def brightness(drawn: PathCollection) -> float:
 
 def test_members_are_dots_from_pale_to_dark_with_what_was_chosen_marked() -> None:
     accuracy = spread(2)
-    fig = plots.members(
+    fig = members(
         accuracy,
         [0, 5, 10],
         GROUPS[:2],
@@ -194,7 +195,7 @@ def test_members_are_dots_from_pale_to_dark_with_what_was_chosen_marked() -> Non
 def test_members_of_several_groups_are_shown_pair_by_pair(count: int) -> None:
     names = GROUPS[:count]
     oracle = {name: np.full(count, 0.8) for name in names}
-    fig = plots.members(
+    fig = members(
         spread(count),
         [0, 1, 2],
         names,
@@ -218,7 +219,7 @@ def test_members_of_several_groups_are_shown_pair_by_pair(count: int) -> None:
 
 
 def test_members_of_one_generation_without_baselines() -> None:
-    fig = plots.members(spread(2, 1), [60], ["a", "b"], catered={})
+    fig = members(spread(2, 1), [60], ["a", "b"], catered={})
     assert len(fig.axes) == 1, "no colour bar for one generation"
     assert not fig.legends
     assert brightness(dots(fig.axes[0])[0]) < 0.5
@@ -226,11 +227,11 @@ def test_members_of_one_generation_without_baselines() -> None:
 
 def test_members_checks_what_it_is_given() -> None:
     with pytest.raises(ValueError, match=r"2 generations and 2 groups .* got shape \(3, 4, 2\)"):
-        plots.members(spread(2), [0, 1], ["a", "b"], catered={})
+        members(spread(2), [0, 1], ["a", "b"], catered={})
     with pytest.raises(ValueError, match=r"1 groups \(at least 2\), got shape \(3, 4, 1\)"):
-        plots.members(spread(1), [0, 1, 2], ["a"], catered={})
+        members(spread(1), [0, 1, 2], ["a"], catered={})
     with pytest.raises(ValueError, match=r"groups of \['a', 'b'\], got \['c'\]"):
-        plots.members(spread(2), [0, 1, 2], ["a", "b"], catered={"c": 0})
+        members(spread(2), [0, 1, 2], ["a", "b"], catered={"c": 0})
 
 
 # Curves
@@ -303,80 +304,6 @@ def test_a_missing_column_is_named() -> None:
     for draw in (plots.learning_curves, plots.selection):
         with pytest.raises(ValueError, match=r"have the columns .*\['generation'\] are missing"):
             draw(curves().drop(columns="generation"))
-    with pytest.raises(ValueError, match=r"\['method', 'group', 'measure', 'value'\] are missing"):
-        plots.recovery_bars(curves())
-
-
-# Recovery
-
-
-def bars(ax: Axes) -> list[Rectangle]:
-    return [patch for patch in ax.patches if isinstance(patch, Rectangle)]
-
-
-def tidy(values: dict[tuple[str, str], list[float]]) -> pd.DataFrame:
-    rows = [(m, g, "recovery", value) for (m, g), all_ in values.items() for value in all_]
-    rows += [("popl", "upper", "return", 100.0)]
-    return pd.DataFrame(rows, columns=["method", "group", "measure", "value"])
-
-
-def test_recovery_is_a_bar_for_each_method_and_group_between_random_and_oracle() -> None:
-    results = tidy(
-        {
-            ("cpl", "upper"): [0.97],
-            ("cpl", "lower"): [0.3],
-            ("popl", "upper"): [0.95],
-            ("popl", "lower"): [0.9],
-            ("oracle", "upper"): [1.0],
-            ("random", "upper"): [0.0],
-            ("mine", "lower"): [0.5],
-        }
-    )
-    fig = plots.recovery_bars(results)
-    (ax,) = fig.axes
-    heights = {round(bar.get_x() + bar.get_width() / 2, 3): bar.get_height() for bar in bars(ax)}
-    width = 0.8 / 3
-    assert heights == pytest.approx(
-        {
-            round(-width, 3): 0.95,
-            0.0: 0.97,
-            round(1 - width, 3): 0.9,
-            1.0: 0.3,
-            round(1 + width, 3): 0.5,
-        }
-    )
-    assert [text.get_text() for text in fig.legends[0].get_texts()] == [
-        "POPL (catered)",
-        "CPL on everybody's answers",
-        "mine",
-    ]
-    assert [label.get_text() for label in ax.get_xticklabels()] == ["“upper”", "“lower”"]
-    assert {float(np.asarray(line.get_ydata())[0]) for line in ax.lines} == {0, 1}
-    for words in ("0.95", "0.30", "as good as the oracle", "as good as random actions"):
-        assert words in texts(fig)
-    assert_nothing_overlaps_the_edge(fig)
-
-
-def test_recovery_of_several_runs_is_averaged_and_dotted() -> None:
-    fig = plots.recovery_bars(tidy({("popl", "upper"): [0.8, 1.0, np.nan]}))
-    (ax,) = fig.axes
-    assert bars(ax)[0].get_height() == pytest.approx(0.9)
-    assert points(dots(ax)[0])[:, 1].tolist() == [0.8, 1.0]
-
-
-def test_recovery_far_outside_is_cut_off_but_named() -> None:
-    fig = plots.recovery_bars(tidy({("popl", "upper"): [-7.0], ("popl", "lower"): [3.0]}))
-    (ax,) = fig.axes
-    low, high = ax.get_ylim()
-    assert all(low < bar.get_height() < high for bar in bars(ax))
-    assert "−7.00 ↓" in texts(fig)
-    assert "3.00 ↑" in texts(fig)
-
-
-def test_recovery_needs_numbers() -> None:
-    results = tidy({("oracle", "upper"): [1.0], ("popl", "upper"): [float("nan")]})
-    with pytest.raises(ValueError, match=r"'recovery' of a method other than .* run the baselines"):
-        plots.recovery_bars(results)
 
 
 def test_colours_are_all_different() -> None:

@@ -1,3 +1,4 @@
+import inspect
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ from matplotlib.patches import Circle, FancyArrowPatch
 
 from popl_rl.evaluation.ranking_agreement import rank_shares
 from popl_rl.plotting import style as plot_style
-from popl_rl.plotting import utility_plots
-from popl_rl.plotting.utility_plots import Curves, agreement, majority_figure, utilities
+from popl_rl.plotting.agreement_plots import agreement
+from popl_rl.plotting.majority_plots import majority_figure
+from popl_rl.plotting.utility_plots import Curves, utilities
 from popl_rl.raters.condorcet import majority_preference
 
 STATES = np.linspace(0, 1, 21)
@@ -361,7 +363,10 @@ def test_the_majority_is_checked(preferred: Any, cycle: Any, message: str) -> No
 
 
 def test_pyplot_is_not_used_and_figures_are_saved(tmp_path: Path) -> None:
-    source = Path(utility_plots.__file__).read_text()
+    source = "".join(
+        inspect.getsource(inspect.getmodule(draw))
+        for draw in (utilities, agreement, majority_figure)
+    )
     assert "import matplotlib.pyplot" not in source
     assert "rcParams" not in source
     before = dict(mpl.rcParams)

@@ -4,17 +4,15 @@ import json
 import shutil
 import sys
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 
 import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 
+from popl_rl.evaluation.statistics import RESULT_COLUMNS, read_results
 from popl_rl.experiments import benchmark_report
-from popl_rl.experiments.cells import plan
 from popl_rl.experiments.run_folder import save_config, write_metadata
-from popl_rl.experiments.suites import load_suite
 from popl_rl.trainers import benchmark_cells, run_benchmark
 from popl_rl.trainers.run_benchmark import BenchmarkConfig, run
 
@@ -62,9 +60,13 @@ class Trainer:
             (folder / "data" / "segments").mkdir(parents=True, exist_ok=True)
             (folder / "baselines").mkdir(exist_ok=True)
         value = 0.9 if config.method.name == "popl" else 0.4
-        rows = [("popl", "upper", "recovery", value - 0.01 * config.seed)]
-        rows += [("popl_lexicase", "upper", "recovery", 0.2), ("cpl", "upper", "recovery", 0.1)]
-        table = pd.DataFrame(rows, columns=["method", "group", "measure", "value"])
+        own, group = config.method.name, ("upper", "recovery")
+        rows = [
+            (own, "posterior", *group, value - 0.01 * config.seed),
+            (own, "lexicase", *group, 0.2),
+            ("pooled_cpl", "", *group, 0.1),
+        ]
+        table = pd.DataFrame(rows, columns=RESULT_COLUMNS)
         table.to_csv(folder / "results.csv", index=False)
 
 
@@ -75,7 +77,7 @@ def _elsewhere(monkeypatch, tmp_path):
     Path("mine.yaml").write_text(SUITE)
 
 
-compose = cache(benchmark_cells._compose)
+compose = cache(benchmark_cells.compose_train)
 
 
 def nothing_to_draw(suite, results):
@@ -87,7 +89,9 @@ def trainer(monkeypatch):
     trainer = Trainer()
     monkeypatch.setattr(benchmark_cells.train_popl, "run", trainer)
     # Both take longer than all the rest.
-    monkeypatch.setattr(benchmark_cells, "_compose", lambda overrides: compose(tuple(overrides)))
+    monkeypatch.setattr(
+        benchmark_cells, "compose_train", lambda overrides: compose(tuple(overrides))
+    )
     monkeypatch.setattr(benchmark_report, "scenario_bars", nothing_to_draw)
     return trainer
 
@@ -106,15 +110,15 @@ def test_every_cell_is_run_once_and_the_results_are_put_together(trainer):
     assert trainer.cells[:4] == CELLS
     assert len(trainer.cells) == 8
     assert result.failures == {}
-    results = pd.read_csv("out/results.csv")
-    assert list(results) == ["suite", "scenario", "seed", "method", "group", "measure", "value"]
+    results = read_results(Path("out/results.csv"))
+    assert list(results) == ["suite", "scenario", "seed", *RESULT_COLUMNS]
     assert set(results.suite) == {"mine"}
     chosen = results[(results.measure == "recovery") & (results.scenario == "noisy")]
-    of = chosen.set_index(["method", "seed"]).value.to_dict()
-    assert of["popl", 1] == pytest.approx(0.89)
-    assert of["other", 0] == 0.4
-    assert of["other_lexicase", 1] == 0.2
-    assert of["cpl", 0] == 0.1
+    of = chosen.set_index(["method", "choice", "seed"]).value.to_dict()
+    assert of["popl", "posterior", 1] == pytest.approx(0.89)
+    assert of["other", "posterior", 0] == 0.4
+    assert of["other", "lexicase", 1] == 0.2
+    assert of["pooled_cpl", "", 0] == 0.1
     assert len(of) == 10
     assert len(results[results.measure == "seconds"]) == 8
     report = Path("out/report.md").read_text()
@@ -376,63 +380,3 @@ def test_a_folder_of_another_suite(call, trainer):
     code, text = call(*MINE, "suite=other.yaml")
     assert code == 2
     assert "run_dir out holds suite 'mine', not 'other'; choose another run_dir" in text
-
-
-# For real
-
-
-@pytest.mark.parametrize("name", ["smoke", "stateless", "sweeps", "two_doors"])
-def test_scenarios_and_methods_of_our_suites_are_configurations(name):
-    suite = load_suite(name, folder=files("popl_rl.configs.suites"))
-    cells = plan(suite, seeds=1)
-    # Every scenario and every method, but not every pair: it takes long.
-    chosen = [cell for cell in cells if cell.leads or cell.scenario == cells[0].scenario]
-    assert len(benchmark_cells.make_tasks(chosen, Path())) == len(chosen)
-
-
-def test_a_real_benchmark_in_a_worker_process(tiny, capfd):
-    """What methods are compared with is the same for all of them."""
-    overrides = OmegaConf.to_yaml({"overrides": [one for one in tiny if one != "logger=csv"]})
-    scenarios = "methods: {popl: [], other: ['method.hidden=[6]']}\nscenarios: {plain: []}\n"
-    Path("mine.yaml").write_text(overrides + scenarios)
-    result = run(config(workers=1))
-    assert result.failures == {}
-    results = pd.read_csv("out/results.csv")
-    assert set(results.method) == {
-        "popl",
-        "popl_lexicase",
-        "other",
-        "other_lexicase",
-        "cpl",
-        "oracle",
-        "random",
-    }
-    first, other = (cell_folder(f"plain/{name}/seed0") for name in ("popl", "other"))
-    assert (first / "data").is_dir()
-    assert not (other / "data").exists()
-    own = pd.read_csv(other / "results.csv").set_index(["method", "group", "measure"]).value
-    shared = pd.read_csv(first / "results.csv").set_index(["method", "group", "measure"]).value
-    for baseline in ("cpl", "oracle", "random"):
-        pd.testing.assert_series_equal(own[baseline], shared[baseline])
-    assert not own["popl"].equals(shared["popl"])
-    assert not list(Path("out/logs").rglob("*.txt")), "no warnings"
-    assert Path("out/figures/recovery.png").stat().st_size > 1000
-    output = capfd.readouterr()
-    assert output.out == output.err == ""
-
-
-@pytest.mark.slow
-def test_a_launcher_takes_cells_to_other_processes(call, tiny):
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    overrides = OmegaConf.to_yaml({"overrides": [one for one in tiny if one != "logger=csv"]})
-    methods = "methods: {popl: [], other: [method.training.steps=3]}\nscenarios: {plain: []}\n"
-    Path("mine.yaml").write_text(overrides + methods)
-    launcher = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
-    code, text = call("-m", "suite=mine.yaml", "seeds=1", "run_dir=out", "cell=0,1", *launcher)
-    assert code == 0, text
-    folders = [cell_folder(f"plain/{method}/seed0") for method in ("popl", "other")]
-    written = [(folder / "cell.json").read_bytes() for folder in folders]
-    result = run(config())
-    assert result.failures == {}
-    assert [(folder / "cell.json").read_bytes() for folder in folders] == written
-    assert set(result.results.method) >= {"popl", "other", "oracle"}

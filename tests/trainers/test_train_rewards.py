@@ -63,15 +63,11 @@ def test_beside_what_they_are_compared_with(result):
     results = result.board.results
     assert set(results.method) == {
         "popl",
-        "popl_lexicase",
         "bradley_terry",
         "oracle",
         "brex",
-        "brex_lexicase",
         "dpl_mean_variance",
-        "dpl_mean_variance_risk_averse",
         "dpl_categorical",
-        "dpl_categorical_risk_averse",
         "random",
     }
     for measure in ("recovery", "accuracy"):

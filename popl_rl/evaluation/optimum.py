@@ -1,0 +1,121 @@
+"""Exact returns and the share of the optimum, where every transition is known."""
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F  # noqa: N812 - the name everyone knows
+from torch import Tensor
+
+from popl_rl.data.tables import Table, policy_return
+from popl_rl.evaluation.measures import recovery
+from popl_rl.keys import OBSERVATION
+from popl_rl.models.policy_set import PolicySet
+from popl_rl.raters.groups import RaterGroup
+
+__all__ = ["ExactReturns", "action_probabilities", "optimal_return"]
+
+_TOLERANCE = 1e-9
+
+
+def action_probabilities(
+    policies: PolicySet | Tensor | None, table: Table, *, greedy: bool = False
+) -> Tensor:
+    """Look up what policies do in every state of a table.
+
+    Args:
+        policies: P policies over discrete actions, or their tables ``[P, S, A]`` already; None for
+            uniformly random actions, as one policy.
+        table: S states and A actions.
+        greedy: Whether policies take their most likely action instead of sampling one.
+
+    Returns:
+        Probabilities ``[P, S, A]`` on the CPU.
+    """
+    if policies is None:
+        states, actions = table.next_state.shape
+        return torch.full((1, states, actions), 1 / actions)
+    if isinstance(policies, Tensor):
+        return policies.cpu()
+    # The last axis of steps is the action; what is observed before it does not depend on it.
+    observation = table.steps[OBSERVATION][:, 0].to(policies.population.device)
+    with torch.no_grad():
+        output = policies.population(observation).cpu()
+    if greedy:
+        return F.one_hot(output.argmax(-1), output.shape[-1]).float()
+    probabilities: Tensor = output.softmax(-1)
+    return probabilities
+
+
+def optimal_return(table: Table, utility: Tensor, *, horizon: int) -> float:
+    """Highest expected undiscounted return of an episode, by backward induction in float64.
+
+    Args:
+        table: S states and A actions.
+        utility: What each step is worth, ``[S, A]``.
+        horizon: Steps after which an episode is cut off.
+    """
+    gain, goes_on = utility.double(), (~table.terminal).double()
+    value = gain.new_zeros(len(gain))
+    for _ in range(horizon):
+        value = (gain + goes_on * value[table.next_state]).amax(1)
+    start = table.start.double()
+    return float(start @ value / start.sum())
+
+
+class ExactReturns:
+    """Expected returns of policies to every group, without rollouts and their noise.
+
+    The optimum may act by the number of steps left, so that no policy, whatever it knows, is above
+    1. Groups must judge every step by itself, as their exact labels need anyway.
+
+    Args:
+        table: Every transition of the environment.
+        groups: G groups.
+        horizon: Steps after which an episode is cut off.
+        greedy: Whether policies take their most likely action instead of sampling one.
+
+    Attributes:
+        optimum: Highest possible return to each group, ``[G]`` float64.
+        random: Return of uniformly random actions to each group, ``[G]`` float64.
+    """
+
+    def __init__(
+        self, table: Table, groups: Sequence[RaterGroup], *, horizon: int, greedy: bool = False
+    ) -> None:
+        self.table, self.horizon, self.greedy = table, horizon, greedy
+        self.utilities = [group.step_utility(table.steps) for group in groups]
+        self.optimum = torch.tensor(
+            [optimal_return(table, utility, horizon=horizon) for utility in self.utilities],
+            dtype=torch.float64,
+        )
+        self.random = self(None)[0]
+
+    def __call__(self, policies: PolicySet | Tensor | None) -> Tensor:
+        """Exact returns to every group.
+
+        Args:
+            policies: See :func:`action_probabilities`.
+
+        Returns:
+            ``[P, G]`` float64.
+        """
+        tables = action_probabilities(policies, self.table, greedy=self.greedy)
+        returns = [
+            [
+                policy_return(self.table, own, utility, horizon=self.horizon)
+                for utility in self.utilities
+            ]
+            for own in tables
+        ]
+        return torch.tensor(returns, dtype=torch.float64)
+
+    def share_of_optimum(self, index: int, value: float) -> float:
+        """``(value - random) / (optimum - random)`` of a return to the group of this index.
+
+        NaN where a group likes nothing better than random actions.
+        """
+        low, high = float(self.random[index]), float(self.optimum[index])
+        # The two are sums in different orders, which differ in the last digits where all is alike.
+        if high - low <= _TOLERANCE * max(1.0, abs(high)):
+            return float("nan")
+        return recovery(value, reference=low, oracle=high)
