@@ -1,1 +1,6 @@
-"""Environments that ship with popl_rl, and the rater groups that live in them."""
+"""Environments that ship with popl_rl, and the rater groups that live in them.
+
+* ``two_doors``, ``two_doors_alike``: a small grid, solved exactly.
+* ``hidden_utility``, ``hidden_plane``: nothing to learn but what people want.
+* ``metaworld_tasks``: a robot arm at fifty tasks.
+"""

@@ -5,21 +5,55 @@ the episode had come.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDict
 
 from popl_rl.envs._metaworld_scripts import Scripted
-from popl_rl.envs.metaworld_tasks import MetaworldTask, TaskState
 from popl_rl.keys import ACTION, INFO, OBSERVATION, REWARD
 
-__all__ = ["check_scripted", "collect_continuations"]
+__all__ = ["Continued", "check_scripted", "collect_continuations"]
+
+
+class Continued(Protocol):
+    """An environment that can be put back into a state: a Metaworld task.
+
+    Attributes:
+        task: Its name.
+        max_steps: Steps after which an episode is truncated.
+    """
+
+    task: str
+    max_steps: int
+
+    def behaviours(self) -> dict[str, Scripted]:
+        """Return the scripted behaviours, by name ``scripted/...`` or ``rough/...``."""
+        ...
+
+    def reset(self, *, seed: int | None = None) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode; return its observation ``[O]`` and info."""
+        ...
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Take an action ``[A]``."""
+        ...
+
+    def get_state(self) -> Any:
+        """Return all that the episode goes on from."""
+        ...
+
+    def set_state(self, state: Any) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Go on from a state, to the bit; return its observation ``[O]`` and info."""
+        ...
 
 
 def collect_continuations(
-    env: MetaworldTask,
+    env: Continued,
     *,
     starts: int,
     per_start: int = 4,
@@ -82,7 +116,7 @@ def collect_continuations(
 
 
 def check_scripted(
-    env: MetaworldTask, *, episodes: int = 10, least: float = 0.5, seed: int = 0
+    env: Continued, *, episodes: int = 10, least: float = 0.5, seed: int = 0
 ) -> dict[str, float]:
     """Measure how often the environment's behaviours do the task, and refuse if they rarely do.
 
@@ -120,8 +154,8 @@ def check_scripted(
 
 
 def _episode(
-    env: MetaworldTask, behaviour: Scripted, seed: int, generator: torch.Generator
-) -> tuple[list[TaskState], bool]:
+    env: Continued, behaviour: Scripted, seed: int, generator: torch.Generator
+) -> tuple[list[Any], bool]:
     """Return every fourth state of an episode until the task is done, and whether it was."""
     behaviour.reset()
     observation, _ = env.reset(seed=seed)
@@ -137,8 +171,8 @@ def _episode(
 
 
 def _continue(
-    env: MetaworldTask,
-    state: TaskState,
+    env: Continued,
+    state: Any,
     behaviour: Scripted,
     length: int,
     generator: torch.Generator,

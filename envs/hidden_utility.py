@@ -106,8 +106,8 @@ def sample_states(
 ) -> TensorDict:
     """Draw segments without stepping through an environment.
 
-    They are distributed as those that :func:`~popl_rl.data.segments.collect_segments` cuts from episodes
-    of :class:`HiddenUtility`, and have the same keys.
+    They are distributed as those that :func:`~popl_rl.data.segments.collect_segments` cuts from
+    episodes of :class:`HiddenUtility`, and have the same keys.
 
     Args:
         count: Segments N.

@@ -15,8 +15,10 @@ from torchrl import logger
 from torchrl.envs import GymWrapper
 from torchrl.envs.utils import check_env_specs
 
+from popl_rl.data.behaviours import first_action
+from popl_rl.data.environments import counting_from_zero
 from popl_rl.data.tables import Table
-from popl_rl.keys import INFO, OBSERVATION, REWARD
+from popl_rl.keys import ACTION, INFO, OBSERVATION, REWARD
 
 Env: TypeAlias = gymnasium.Env[Any, Any]
 
@@ -54,16 +56,13 @@ def check_spaces(name: str, env: Env) -> None:
             "gymnasium.wrappers.DtypeObservation(env, np.float32)."
         )
     if isinstance(acts, gymnasium.spaces.Discrete):
-        if acts.start != 0:
-            raise ValueError(
-                f"env {name!r}: actions must start at 0, got {acts}; shift them in the environment."
-            )
-    elif not isinstance(acts, gymnasium.spaces.Box) or len(acts.shape) != 1:
+        return
+    if not isinstance(acts, gymnasium.spaces.Box) or len(acts.shape) != 1:
         raise TypeError(
             f"env {name!r}: action_space must be Discrete or a Box with one dimension, got {acts}; "
             "wrap it in gymnasium.wrappers.TransformAction."
         )
-    elif not acts.is_bounded():
+    if not acts.is_bounded():
         raise ValueError(
             f"env {name!r}: a Box of actions must be bounded, got {acts}; give it low and high."
         )
@@ -192,6 +191,13 @@ def check_table(name: str, table: Any, env: Env, steps: list[Step]) -> None:
             f"env {name!r}: transition_table() lists {table.next_state.shape[1]} actions, but "
             f"action_space is {env.action_space}; list every action of a Discrete space."
         )
+    first = first_action(env.action_space)
+    expected = first + torch.arange(count)
+    if not bool((table.steps[ACTION].long() == expected).all()):
+        raise ValueError(
+            f"env {name!r}: column a of transition_table()'s 'action' must be the environment's "
+            f"action {first} + a everywhere, as action_space is {env.action_space}."
+        )
     listed = set(table.steps[INFO].keys())
     given = steps[0].info.keys()
     if not {"state", "next_state"} <= given or not given <= listed:
@@ -206,9 +212,10 @@ def check_table(name: str, table: Any, env: Env, steps: list[Step]) -> None:
             if not 0 <= current < len(table.start) or table.start[current] <= 0:
                 _disagree(name, f"start gives no probability to the first state {current}")
             continue
-        row = table.steps[current, int(step.action)]
+        column = int(step.action) - first
+        row = table.steps[current, column]
         where = f"at state {current} and action {int(step.action)}"
-        after = int(table.next_state[current, int(step.action)])
+        after = int(table.next_state[current, column])
         if step.info["state"] != current:
             raise ValueError(
                 f"env {name!r}: info['state'] must be the state before the step, {current}, got "
@@ -216,7 +223,7 @@ def check_table(name: str, table: Any, env: Env, steps: list[Step]) -> None:
             )
         if step.info["next_state"] != after:
             _disagree(name, f"next_state is {after} {where}, stepped to {step.info['next_state']}")
-        if step.terminated != bool(table.terminal[current, int(step.action)]):
+        if step.terminated != bool(table.terminal[current, column]):
             _disagree(name, f"terminal is {not step.terminated} {where}, it was {step.terminated}")
         if not np.isclose(step.reward, float(row[REWARD]), atol=1e-5):
             _disagree(name, f"reward is {float(row[REWARD]):g} {where}, got {step.reward:g}")
@@ -260,12 +267,14 @@ def check_behaviours(name: str, found: Any) -> None:
 
 def check_torchrl(name: str, env: Env) -> None:
     """Check that TorchRL can wrap the environment."""
+    # TorchRL counts discrete actions from 0 whatever the space says.
+    counted = counting_from_zero(env)
     level = logger.level
     logger.setLevel("ERROR")
     try:
         # The check seeds torch's own generator.
         with torch.random.fork_rng(devices=[]):
-            check_env_specs(GymWrapper(env, categorical_action_encoding=True))
+            check_env_specs(GymWrapper(counted, categorical_action_encoding=True))
     except Exception as error:
         raise ValueError(
             f"env {name!r}: TorchRL's check_env_specs failed with {type(error).__name__}: "

@@ -2,7 +2,8 @@
 
 Nothing is known here by name. Objects are found because they were decorated (:func:`env`,
 :func:`rater`, :func:`behaviour`) or because an installed package declares them as entry points in
-the group ``popl_rl.env``, ``popl_rl.rater`` or ``popl_rl.behaviour``. References, not objects, are
+the group of its kind: ``popl_rl.env``, ``popl_rl.rater``, ``popl_rl.behaviour``,
+``popl_rl.selection``, ``popl_rl.method`` or ``popl_rl.reader``. References, not objects, are
 what configurations and worker processes carry.
 """
 
@@ -11,23 +12,35 @@ import hashlib
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
-__all__ = ["Kind", "behaviour", "env", "names", "rater", "resolve"]
+__all__ = [
+    "Kind",
+    "behaviour",
+    "env",
+    "isolated",
+    "method",
+    "names",
+    "rater",
+    "reader",
+    "resolve",
+    "selection",
+]
 
-Kind = Literal["env", "rater", "behaviour"]
+Kind = Literal["env", "rater", "behaviour", "selection", "method", "reader"]
 _T = TypeVar("_T", bound=Callable[..., Any])
 
 _FORMS = (
     "A reference is a registered name, 'package.module:attr' or 'path/file.py:attr' "
     "(a relative path starts at the current directory)."
 )
-_registered: dict[str, dict[str, Any]] = {"env": {}, "rater": {}, "behaviour": {}}
+_registered: dict[str, dict[str, Any]] = {kind: {} for kind in get_args(Kind)}
 
 
 def env(name: str) -> Callable[[_T], _T]:
@@ -74,6 +87,44 @@ def behaviour(name: str) -> Callable[[_T], _T]:
     return _decorator("behaviour", name)
 
 
+def selection(name: str) -> Callable[[_T], _T]:
+    """Register a rule of selection: ``(values [member, case], count, *, generator) -> parents``.
+
+    Args:
+        name: What configurations call it.
+
+    Raises:
+        ValueError: When decorating, if another object has the name.
+    """
+    return _decorator("selection", name)
+
+
+def method(name: str) -> Callable[[_T], _T]:
+    """Register a method: a class that is built from a ``Problem`` and has steps and a result.
+
+    See :class:`popl_rl.algorithms.problem.Method`.
+
+    Args:
+        name: What configurations call it.
+
+    Raises:
+        ValueError: When decorating, if another object has the name.
+    """
+    return _decorator("method", name)
+
+
+def reader(name: str) -> Callable[[_T], _T]:
+    """Register a reader of other people's data: path -> segments and preferences.
+
+    Args:
+        name: What configurations call it.
+
+    Raises:
+        ValueError: When decorating, if another object has the name.
+    """
+    return _decorator("reader", name)
+
+
 def names(kind: Kind) -> list[str]:
     """List the names known for a kind, sorted: decorated so far or from installed packages."""
     _check_kind(kind)
@@ -86,7 +137,7 @@ def resolve(kind: Kind, reference: str) -> Any:
     A file is loaded once per process. Loading it also registers what it decorates.
 
     Args:
-        kind: What is expected: "env", "rater" or "behaviour".
+        kind: What is expected, such as "env" or "rater".
         reference: A registered name, ``package.module:attr`` or ``path/file.py:attr``.
 
     Raises:
@@ -258,3 +309,22 @@ def _attribute(kind: Kind, reference: str, module: ModuleType, name: str) -> Any
         f"{kind} {reference!r}: {module.__file__} has no {name!r}.{guess} It defines: "
         f"{', '.join(own) or 'nothing'}."
     )
+
+
+@contextmanager
+def isolated() -> Iterator[None]:
+    """Start with nothing decorated and forget afterwards what was: for tests of plug-ins.
+
+    Names that installed packages declare stay known, as in a new process.
+    """
+    kept = {kind: dict(found) for kind, found in _registered.items()}
+    for found in _registered.values():
+        found.clear()
+    _entry_points.cache_clear()
+    try:
+        yield
+    finally:
+        for kind, found in kept.items():
+            _registered[kind].clear()
+            _registered[kind].update(found)
+        _entry_points.cache_clear()

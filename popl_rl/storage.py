@@ -22,25 +22,59 @@ __all__ = [
     "save_tensordict",
     "write_atomic",
     "write_json",
+    "written_beside",
 ]
 
 
-def save_tensordict(data: TensorDictBase, path: Path) -> None:
-    """Write a TensorDict as memory maps and JSON: beside the target first, then renamed.
+@contextmanager
+def written_beside(path: Path) -> Iterator[Path]:
+    """Write a whole folder or nothing: a folder to fill, which at the end takes the name ``path``.
+
+    If the block fails, what it wrote is removed; if the process is killed, what it wrote stays
+    beside the target, in a folder whose name begins with a dot. Folders above ``path`` are made.
+
+    Args:
+        path: The folder to be.
+
+    Yields:
+        An empty folder, on the same file system.
 
     Raises:
         FileExistsError: If ``path`` exists.
+
+    Example:
+        >>> with written_beside(Path(folder) / "set") as beside:
+        ...     write_json(beside / "about.json", {"members": 3})
+        >>> (Path(folder) / "set" / "about.json").is_file()
+        True
     """
     path = Path(path)
     if path.exists():
         raise FileExistsError(f"{path} exists; remove it or choose another path")
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    outer = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:
-        data.detach().cpu().clone().memmap(beside / "data", copy_existing=True)
-        (beside / "data").rename(path)
+        # The outer folder is for its owner's eyes only; this one has the usual permissions.
+        beside = outer / "whole"
+        beside.mkdir()
+        yield beside
+        beside.rename(path)
     finally:
-        shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(outer, ignore_errors=True)
+
+
+def save_tensordict(data: TensorDictBase, path: Path) -> None:
+    """Write a TensorDict of any shape as memory maps and JSON; nothing is left half-written.
+
+    Args:
+        data: What to write, from whichever device.
+        path: The folder to be.
+
+    Raises:
+        FileExistsError: If ``path`` exists.
+    """
+    with written_beside(path) as beside:
+        data.detach().cpu().clone().memmap(beside, copy_existing=True)
 
 
 def load_tensordict(path: Path, *, required: Mapping[str, int] | None = None) -> TensorDict:
@@ -94,7 +128,10 @@ def _check_whole(path: Path) -> None:
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Be the only process, on this machine or another, that makes what belongs to ``path``."""
+    """Be the only process, on this machine or another, that makes what belongs to ``path``.
+
+    Waits until no other process holds the lock, a hidden file beside ``path`` that stays.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     with (path.parent / f".{path.name}.lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
@@ -103,6 +140,14 @@ def locked(path: Path) -> Iterator[None]:
 
 @contextmanager
 def explaining_full_disk(path: Path) -> Iterator[None]:
+    """Say of a full disk that it is full, what is safe and what to do.
+
+    Args:
+        path: The file that is being written.
+
+    Raises:
+        OSError: What the block raised; if the disk is full or its quota used up, explained.
+    """
     try:
         yield
     except OSError as error:

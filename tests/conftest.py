@@ -6,10 +6,14 @@ from hydra import compose, initialize_config_module
 
 import popl_rl.trainers.run_benchmark
 import popl_rl.trainers.train_popl  # noqa: F401 - they make the schemas known to Hydra
+from popl_rl.algorithms.problem import Problem
+from popl_rl.config import MethodConfig, Training
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.behaviours import random_behaviour
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.data.segments import collect_segments, segment_buffer
+from popl_rl.experiments.builders import build_method, build_problem
+from popl_rl.models.policies import PolicySpec
 from popl_rl.raters.collector import collect_preferences
 from popl_rl.raters.groups import make_groups
 from popl_rl.raters.people import Raters
@@ -23,8 +27,10 @@ TINY = [
     "env.max_steps=20",
     "method.generations=3",
     "method.members=4",
-    "method.steps=2",
-    "method.polish_steps=20",
+    "method.training.steps=100",
+    "method.training.batch_size=64",
+    "method.training.learning_rate=0.02",
+    "method.refinement.steps=20",
     "method.hidden=[8]",
     "data.segments=200",
     "data.length=6",
@@ -34,9 +40,6 @@ TINY = [
     "evaluation.new_raters=2",
     "evaluation.curve=[1,5]",
     "evaluation.pairs=200",
-    "evaluation.baseline_steps=100",
-    "evaluation.baseline_batch_size=64",
-    "evaluation.baseline_learning_rate=0.02",
     "logger=csv",
 ]
 
@@ -116,6 +119,34 @@ def preferences(segments, groups):
         generator=torch.Generator().manual_seed(1),
     )
     return buffer[:].exclude("index")
+
+
+@pytest.fixture(scope="session")
+def learner():
+    """Builds a method from settings by name, such as ``training__steps=20``, as a run does."""
+
+    def make(spec, bank, comparisons, *, clone=None, generator=None, num_groups=2, **settings):
+        config = MethodConfig()
+        for path, value in settings.items():
+            *sections, name = path.split("__")
+            section = config
+            for part in sections:
+                section = getattr(section, part)
+            assert hasattr(section, name), path
+            setattr(section, name, value)
+        problem = build_problem(config, spec, bank, comparisons, clone=clone)
+        generator = torch.Generator().manual_seed(0) if generator is None else generator
+        return build_method(config, problem, num_groups=num_groups, generator=generator)
+
+    return make
+
+
+@pytest.fixture
+def problem(bank, comparisons):
+    """Policies with a hidden layer of 8 on the line of five cells, trained for a moment."""
+    training = Training(steps=20, batch_size=16)
+    spec = PolicySpec(5, 2, True, (8,))
+    return Problem(spec, bank, comparisons, training, members=6, generations=10)
 
 
 @pytest.fixture

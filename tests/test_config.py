@@ -11,6 +11,7 @@ from popl_rl.config import (
     MethodConfig,
     RatersConfig,
     parse_epsilon,
+    unread,
     validate,
 )
 
@@ -57,23 +58,22 @@ CASES = [
         "env__max_steps",
         "raters__count",
         "raters__answers",
-        "data__segments",
         "data__length",
         "evaluation__episodes",
         "evaluation__new_raters",
         "evaluation__answers",
         "evaluation__pairs",
         "evaluation__curve_members",
-        "evaluation__baseline_steps",
-        "evaluation__baseline_batch_size",
         "method__generations",
-        "method__steps",
-        "method__batch_size",
-        "method__teams",
-        "method__team_generations",
-        "method__tournament",
-        "method__groups",
-        "method__latent",
+        "method__training__steps",
+        "method__training__batch_size",
+        "method__mixture__mixtures",
+        "method__mixture__generations",
+        "method__popl__tournament",
+        "method__em__groups",
+        "method__vpl__latent",
+        "method__clone__code_dim",
+        "method__refinement__most",
         "threads",
         "checkpoint_interval",
     ),
@@ -100,30 +100,35 @@ CASES = [
     ("data__segments", 1, "data.segments must be at least 2, to compare, got 1"),
     ("data__load", "/no/such/run/data",
      "data.load must be the folder 'data' of an earlier run, got '/no/such/run/data'"),
-    ("method__algorithm", "sgd",
-     "method.algorithm must be popl, cpl, multi_cpl, em, vpl, got 'sgd'"),
-    ("method__selection", "roulette",
-     "method.selection must be lexicase, tournament, best_sum, random, nsga2, got 'roulette'"),
-    ("method__kl", -0.5, "method.kl must be at least 0, got -0.5"),
+    ("method__factory", "", "method.factory must be a reference of a method, got ''"),
+    ("method__reads", ["training", "magic"],
+     "method.reads must be sections out of training, popl, refinement, mixture, clone, em, vpl, "
+     "got ['magic']"),
+    ("method__popl__selection", "",
+     "method.popl.selection must be lexicase or a reference, got ''"),
+    ("method__vpl__kl", -0.5, "method.vpl.kl must be at least 0, got -0.5"),
+    ("method__training__slip", 0.5, "method.training.slip must be in [0, 0.5), got 0.5"),
+    ("method__refinement__folds", 1, "method.refinement.folds must be at least 2, got 1"),
+    ("method__mixture__held_out", 1.0, "method.mixture.held_out must be in [0, 1), got 1.0"),
     ("method__cases", "group", "method.cases must be rater or preference, got 'group'"),
-    ("method__variation", "cosmic",
-     "method.variation must be auto, gradient, gaussian, teams, got 'cosmic'"),
-    ("method__variation", "gaussian",
+    ("method__popl__variation", "cosmic",
+     "method.popl.variation must be auto, gradient, gaussian, mixtures, got 'cosmic'"),
+    ("method__popl__variation", "gaussian",
      "method.evolve must be head for Gaussian variation, got 'all'"),
     ("method__evolve", "some", "method.evolve must be all, head, code, got 'some'"),
     ("method__members", 1, "method.members must be at least 2, to select among, got 1"),
     ("method__hidden", [64, 0], "method.hidden must be positive, got [64, 0]"),
-    ("method__epsilon", "some",
-     "method.epsilon must be mad, a number of at least 0, or null, got 'some'"),
-    ("method__alpha", 0.0, "method.alpha must be positive, got 0.0"),
-    ("method__alpha", math.nan, "method.alpha must be positive, got nan"),
-    ("method__conservatism", 1.1, "method.conservatism must be in (0, 1], got 1.1"),
-    ("method__conservatism", 0.0, "method.conservatism must be in (0, 1], got 0.0"),
-    ("method__discount", 0.0, "method.discount must be in (0, 1], got 0.0"),
-    ("method__discount", 1.01, "method.discount must be in (0, 1], got 1.01"),
-    ("method__warm_up", -1, "method.warm_up must be at least 0, got -1"),
-    ("method__learning_rate", 0.0, "method.learning_rate must be positive, got 0.0"),
-    ("method__mutation_std", -0.1, "method.mutation_std must be positive, got -0.1"),
+    ("method__popl__epsilon", "some",
+     "method.popl.epsilon must be mad, a number of at least 0, or null, got 'some'"),
+    ("method__training__alpha", 0.0, "method.training.alpha must be positive, got 0.0"),
+    ("method__training__alpha", math.nan, "method.training.alpha must be positive, got nan"),
+    ("method__training__conservatism", 1.1, "method.training.conservatism must be in (0, 1], got 1.1"),
+    ("method__training__conservatism", 0.0, "method.training.conservatism must be in (0, 1], got 0.0"),
+    ("method__training__discount", 0.0, "method.training.discount must be in (0, 1], got 0.0"),
+    ("method__training__discount", 1.01, "method.training.discount must be in (0, 1], got 1.01"),
+    ("method__popl__warm_up", -1, "method.popl.warm_up must be at least 0, got -1"),
+    ("method__training__learning_rate", 0.0, "method.training.learning_rate must be positive, got 0.0"),
+    ("method__popl__mutation_std", -0.1, "method.popl.mutation_std must be positive, got -0.1"),
     ("evaluation__curve", [5, 0], "evaluation.curve must be numbers of at least 1, got [5, 0]"),
     ("evaluation__history", -1, "evaluation.history must be at least 0, got -1"),
     ("logger__name", "paper", "logger.name must be wandb or csv, got 'paper'"),
@@ -136,11 +141,13 @@ def test_a_problem_is_named_with_what_was_expected_and_what_came(path, value, me
 
 
 def test_several_problems_are_reported_together():
-    config = valid(method__cases="group", method__alpha=-1.0, raters__count=0, logger__name="paper")
+    config = valid(
+        method__cases="group", method__training__alpha=-1.0, raters__count=0, logger__name="paper"
+    )
     assert problems_of(config) == [
         "raters.count must be at least 1, got 0",
         "method.cases must be rater or preference, got 'group'",
-        "method.alpha must be positive, got -1.0",
+        "method.training.alpha must be positive, got -1.0",
         "logger.name must be wandb or csv, got 'paper'",
     ]
 
@@ -152,11 +159,11 @@ def test_several_problems_are_reported_together():
         {"raters__shares": [0.9, 0.1]},
         {"raters__shares": [1 / 3, 2 / 3]},
         {"env__mixture": {"planner/*": 0.5, "explorer": 0.5}},
-        {"method__variation": "gaussian", "method__evolve": "head"},
+        {"method__popl__variation": "gaussian", "method__evolve": "head"},
         {"method__hidden": []},
-        {"method__epsilon": None},
-        {"method__epsilon": "0.25"},
-        {"method__warm_up": 0, "evaluation__history": 0},
+        {"method__popl__epsilon": None},
+        {"method__popl__epsilon": "0.25"},
+        {"method__popl__warm_up": 0, "evaluation__history": 0},
         {"raters__response__rationality": math.inf, "raters__response__mistake": 1.0},
     ],
 )
@@ -164,10 +171,41 @@ def test_valid_configurations_pass(changes):
     validate(valid(**changes))
 
 
-@pytest.mark.parametrize("changes", [{"method__algorithm": "vpl"}, {"method__cases": "preference"}])
-def test_style_codes_need_rater_ids_and_a_method_that_trains_them(changes):
+@pytest.mark.parametrize(
+    "changes", [{"method__cases": "preference"}, {"method__popl__variation": "mixtures"}]
+)
+def test_style_codes_need_rater_ids(changes):
     (problem,) = problems_of(valid(method__evolve="code", **changes))
-    assert problem == "method.evolve must be all for VPL, and without rater ids, got 'code'"
+    assert problem == "method.evolve must be all without rater ids, got 'code'"
+
+
+def test_a_method_that_lives_on_ids_is_refused_without_them(config_of):
+    config = config_of("method=vpl", "method.cases=preference")
+    (problem,) = problems_of(config)
+    assert problem == (
+        "method.cases must be rater, because it reads what one rater said, got 'preference'"
+    )
+
+
+READERS = {"popl": ["training", "popl"], "em": ["training", "em"]}
+
+
+def test_settings_that_the_method_does_not_read_are_refused_with_who_does():
+    method = MethodConfig()
+    given = ["method.em.groups=3", "method.popl.epsilon=0", "seed=1", "method.members=4"]
+    (problem,) = unread(given, method, READERS)
+    assert problem == (
+        "method.em.groups is not read by method 'popl', which reads training, popl, refinement, "
+        "mixture; it is read by em"
+    )
+    (problem,) = unread(["+method.vpl.kl=1"], method, READERS)
+    assert problem.endswith("it is read by no known method")
+
+
+def test_settings_of_a_clone_are_for_style_codes():
+    (problem,) = unread(["method.clone.steps=3"], MethodConfig(), READERS)
+    assert problem == "method.clone.steps is read with method.evolve=code alone, got all"
+    assert unread(["method.clone.steps=3"], MethodConfig(evolve="code"), READERS) == []
 
 
 def test_a_folder_with_segments_can_be_loaded(tmp_path):
@@ -185,7 +223,7 @@ def test_epsilon_is_read(epsilon, expected):
 
 @pytest.mark.parametrize("epsilon", ["", "MAD", "-0.1", -0.1, "nan", math.nan])
 def test_epsilon_refuses(epsilon):
-    message = "method.epsilon must be mad, a number of at least 0, or null, got"
+    message = "method.popl.epsilon must be mad, a number of at least 0, or null, got"
     with pytest.raises(ValueError, match=message):
         parse_epsilon(epsilon)
 
@@ -217,11 +255,11 @@ def test_an_environment_can_name_raters_of_its_own(config_of):
     assert len(config_of("env=hidden_utility", "raters=cycle").raters.groups) == 3
 
 
-def test_a_scenario_may_say_how_many_groups_a_mixture_is_told_of(config_of):
-    """A suite's overrides of a scenario come before those of a method: values outrank choices."""
-    config = config_of("method.groups=3", "method=em")
-    assert (config.method.algorithm, config.method.groups) == ("em", 3)
-    assert config_of("method=em").method.groups == 2
+def test_values_outrank_choices_whatever_their_order(config_of):
+    """A suite's overrides of a scenario come before those of a method."""
+    config = config_of("method.em.groups=3", "method=em")
+    assert (config.method.name, config.method.em.groups) == ("em", 3)
+    assert config_of("method=em").method.em.groups is None
 
 
 def test_a_method_outranks_an_environment(config_of):

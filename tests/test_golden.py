@@ -11,27 +11,24 @@ import torch
 
 import popl_rl.algorithms.mixture_population
 import popl_rl.algorithms.popl
-from popl_rl.algorithms.losses import CPLLoss
-from popl_rl.algorithms.mixture_population import MixturePOPL, MixtureSettings
+from popl_rl.algorithms.mixture_population import MixturePOPL
 from popl_rl.algorithms.popl import POPL
+from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.variation import GaussianHead, GradientCPL
-from popl_rl.config import MethodConfig
-from popl_rl.experiments.builders import build_popl, final_set
+from popl_rl.config import MixtureSettings, Training
 from popl_rl.models.policies import PolicySpec
-from popl_rl.models.population import Population
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.models.style_codes import train_clone
 
 FOLDER = Path(__file__).parent / "golden"
 SPEC = PolicySpec(5, 2, True, (8,))
-TEAMS = MixtureSettings(
-    teams=4,
+MIXTURES = MixtureSettings(
+    mixtures=4,
     generations=4,
     steps=3,
-    batch_size=32,
     bundle=5,
     first_selection=1,
-    polish_steps=50,
+    final_steps=50,
     folds=2,
 )
 
@@ -85,31 +82,27 @@ def numbers(popl, metrics):
 @pytest.mark.parametrize("variation", ["gradient", "gaussian"])
 def test_popl(bank, comparisons, selected, golden, generator, variation):
     evolve = "head" if variation == "gaussian" else "all"
-    population = Population.create(SPEC, 6, evolve=evolve, generator=generator)
+    recipe = Training(steps=6, batch_size=16)
+    problem = Problem(SPEC, bank, comparisons, recipe, evolve=evolve, generations=3)
+    population = problem.initial_population(6, generator=generator)
     if variation == "gaussian":
         varied = GaussianHead(population, generator=generator)
     else:
-        loss = CPLLoss(population, bank)
-        varied = GradientCPL(
-            loss, comparisons, generations=3, steps=2, batch_size=16, generator=generator
-        )
-    popl = POPL(population, bank, comparisons, variation=varied, generator=generator)
+        varied = GradientCPL.of(problem, population, generator=generator)
+    popl = POPL(problem, population=population, variation=varied, generator=generator)
     metrics = [popl.step() for _ in range(3)][-1]
     golden(f"popl_{variation}", {"parents": selected, "numbers": numbers(popl, metrics)})
 
 
-def test_teams(bank, comparisons, selected, golden, generator):
-    popl = MixturePOPL(SPEC, bank, comparisons, settings=TEAMS, generator=generator)
+def test_mixtures(bank, comparisons, selected, golden, generator):
+    problem = Problem(SPEC, bank, comparisons, Training(batch_size=32))
+    popl = MixturePOPL(problem, settings=MIXTURES, generator=generator)
     metrics = [popl.step() for _ in range(3)][-1]
-    policies = popl.policies()
+    policies = popl.result()
     found = numbers(popl, metrics)
     found["members chosen"] = len(policies)
-    found["sum chosen"] = float(
-        torch.cat([v.flatten() for v in policies.population.members.data.values(True, True)])
-        .abs()
-        .sum()
-    )
-    golden("teams", {"parents": selected, "numbers": found})
+    found["sum chosen"] = total(policies.population)
+    golden("mixtures", {"parents": selected, "numbers": found})
 
 
 def total(population):
@@ -122,35 +115,38 @@ def total(population):
 #: and the fitted scale included.
 WHOLE = {
     "default": {},
-    "style_codes": {"evolve": "code", "learning_rate": 0.05},
+    "style_codes": {"evolve": "code", "training__learning_rate": 0.05},
     "reward_functions": {"learns": "reward"},
 }
 
 
 @pytest.mark.parametrize("kind", WHOLE)
-def test_the_default_method_as_a_whole(bank, comparisons, golden, kind):
+def test_the_default_method_as_a_whole(learner, bank, comparisons, golden, kind):
     generator = torch.Generator().manual_seed(0)
     spec = RewardSpec(5, 2, (8,)) if kind == "reward_functions" else SPEC
     clone = None
     if kind == "style_codes":
         clone = train_clone(spec, bank, steps=60, batch_size=16, generator=generator)
-    config = MethodConfig(
+    popl = learner(
+        spec,
+        bank,
+        comparisons,
+        clone=clone,
+        generator=generator,
         members=6,
         generations=3,
-        hidden=[8],
-        steps=3,
-        batch_size=16,
-        pooled_steps=10,
-        specialist_steps=5,
-        polish_steps=60,
+        training__steps=9,
+        training__batch_size=16,
+        popl__pooled_steps=10,
+        popl__specialist_steps=5,
+        refinement__steps=60,
         **WHOLE[kind],
     )
-    popl = build_popl(config, spec, bank, comparisons, clone=clone, generator=generator)
     found = {}
     for generation in range(3):
         found |= {f"{generation} {name}": value for name, value in popl.step().items()}
     found["sum of the population"] = total(popl.population)
-    policies = final_set(popl)
+    policies = popl.result()
     found |= {
         "policies": len(policies),
         "alpha": policies.alpha,

@@ -57,7 +57,7 @@ def test_fast_and_gentle_find_their_policies_in_metaworld(config_of, tmp_path):
         "env=metaworld/button_press",
         "data.segments=400",
         f"data.store={tmp_path / 'store'}",
-        "method.clone_steps=1000",
+        "method.clone.steps=1000",
         "method.members=12",
         "method.generations=8",
         "evaluation.episodes=6",

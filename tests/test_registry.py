@@ -26,12 +26,11 @@ def brisk(segments):
 
 
 @pytest.fixture(autouse=True)
-def clean_registry(monkeypatch):
-    """Each test sees what is registered now, and leaves nothing behind."""
-    kept = {kind: dict(found) for kind, found in registry._registered.items()}
-    monkeypatch.setattr(registry, "_registered", kept)
+def clean_registry():
+    """Each test sees what installed packages declare, and leaves nothing behind."""
     before = set(sys.modules)
-    yield
+    with registry.isolated():
+        yield
     for name in set(sys.modules) - before:
         if name.startswith("popl_rl_file_"):
             del sys.modules[name]
@@ -82,9 +81,7 @@ def test_a_taken_name_is_an_error():
         rater("mine")(second)
 
 
-def test_a_name_of_an_installed_package_is_taken_before_it_is_loaded(monkeypatch):
-    monkeypatch.setitem(registry._registered, "rater", {})
-
+def test_a_name_of_an_installed_package_is_taken_before_it_is_loaded():
     with pytest.raises(ValueError, match=r"'upper' is taken by upper in .*two_doors.py"):
 
         @rater("upper")
@@ -217,7 +214,18 @@ def test_kind_and_type_of_a_reference_are_checked():
 def test_two_packages_may_not_declare_one_name(monkeypatch):
     points = [EntryPoint("twin", f"package_{side}:twin", "popl_rl.env") for side in "ab"]
     monkeypatch.setattr(registry, "entry_points", lambda **_: points)
-    registry._entry_points.cache_clear()
     with pytest.raises(ValueError, match=r"'twin' is declared by two installed packages"):
         names("env")
-    registry._entry_points.cache_clear()
+
+
+def test_what_is_registered_in_isolation_is_forgotten():
+    before = names("rater")
+    with registry.isolated():
+        assert names("rater") == before
+
+        @rater("passing")
+        def passing(segments):
+            return segments
+
+        assert resolve("rater", "passing") is passing
+    assert names("rater") == before

@@ -117,7 +117,7 @@ BROKEN_ENVS = {
     "shifted actions": (
         lambda: Broken(action_space=Discrete(2, start=1)),
         ValueError,
-        "actions must start at 0",
+        "column a of transition_table.*'action' must be the environment's action 1 . a",
     ),
     "many actions at once": (
         lambda: Broken(action_space=gymnasium.spaces.MultiDiscrete([2, 2])),

@@ -4,16 +4,17 @@ import logging
 import os
 import sys
 from collections.abc import Callable
+from importlib.resources import files
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from hydra.errors import HydraException
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from rich.console import Console
 
-from popl_rl.config import Config, EvaluateConfig
+from popl_rl.config import Config, EvaluateConfig, plain, unread, validate
 
-__all__ = ["USER_ERRORS", "register_schemas", "run_command"]
+__all__ = ["USER_ERRORS", "prepare", "register_schemas", "run_command"]
 
 #: Errors that mean the user can put it right; anything else is a defect and keeps its traceback.
 USER_ERRORS = (HydraException, OmegaConfBaseException, ValueError, TypeError, OSError)
@@ -38,14 +39,55 @@ def run_command(main: Callable[[], Any]) -> None:
         return
     # Without this Hydra prints errors its own way and leaves with 1, whatever they are.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    errors = Console(stderr=True)
     try:
         main()
     except KeyboardInterrupt:
-        errors.print("\ninterrupted; continue with resume=<folder of the run>", markup=False)
+        _print_error("\ninterrupted; continue with resume=<folder of the run>")
         sys.exit(130)
     except USER_ERRORS as error:
-        errors.print(f"error: {error}", markup=False, highlight=False, soft_wrap=True)
+        _print_error(f"error: {error}")
         sys.exit(2)
     finally:
         del os.environ["HYDRA_FULL_ERROR"]
+
+
+def prepare(config: Any) -> Config:
+    """The settings of a run as dataclasses, after every check that needs nothing but them.
+
+    Args:
+        config: What Hydra composed, or the dataclass.
+
+    Raises:
+        ValueError: Listing every problem, also settings given on the command line that the chosen
+            method does not read.
+    """
+    settings: Config = plain(config)
+    if settings.resume is None:
+        validate(settings)
+    problems = unread(_given(), settings.method, _readers())
+    if problems:
+        raise ValueError("settings that nobody reads:\n  " + "\n  ".join(problems))
+    return settings
+
+
+def _given() -> list[str]:
+    """Overrides of the command line, if Hydra has read one."""
+    from hydra.core.hydra_config import HydraConfig
+
+    if not HydraConfig.initialized():
+        return []
+    return [str(override) for override in HydraConfig.get().overrides.task]
+
+
+def _readers() -> dict[str, list[str]]:
+    """Sections that each shipped method reads, by its name."""
+    found = {}
+    for entry in files("popl_rl.configs.method").iterdir():
+        if entry.name.endswith(".yaml"):
+            content: Any = OmegaConf.create(entry.read_text(encoding="utf-8"))
+            found[entry.name.removesuffix(".yaml")] = list(content.get("reads", []))
+    return dict(sorted(found.items()))
+
+
+def _print_error(text: str) -> None:
+    print(text, file=sys.stderr)

@@ -17,7 +17,8 @@ from popl_rl.config import Config, EvaluateConfig, validate
 from popl_rl.data.environments import build_world
 from popl_rl.evaluation.diagnostics import alarm, diagnostics
 from popl_rl.evaluation.results import Scoreboard
-from popl_rl.experiments.builders import build_groups, build_spec, label_of, make_data
+from popl_rl.experiments.builders import build_spec
+from popl_rl.experiments.data import build_groups, make_data
 from popl_rl.experiments.evaluators import make_evaluator
 from popl_rl.experiments.report import markdown, results_table
 from popl_rl.experiments.run_folder import load_config, save_config
@@ -54,7 +55,7 @@ def run(config: EvaluateConfig) -> tuple[Path, Scoreboard]:
     path = run_dir / "clone"
     clone = load_set(path) if path.is_dir() else None
     evaluator = make_evaluator(stored, world, groups, data, spec, clone=clone, seed=config.seed)
-    board = evaluator.score(found, baselines, label=label_of(stored.method))
+    board = evaluator.score(found, baselines, label=stored.method.name)
     number = 1 + len(list((run_dir / "evaluations").glob("[0-9]*")))
     folder = run_dir / "evaluations" / f"{number:03d}"
     beside = folder.with_name(f".{folder.name}")

@@ -1,22 +1,19 @@
 """What POPL is compared with: pooled CPL, and CPL that knows the groups (the oracle)."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from popl_rl.algorithms.losses import CPLLoss, descend
-from popl_rl.data.bank import SegmentBank
-from popl_rl.data.comparisons import Comparisons
+from popl_rl.algorithms.multi_cpl import MultiCPL
+from popl_rl.algorithms.problem import Method, Problem
 from popl_rl.models.hypothesis_set import HypothesisSet
-from popl_rl.models.policies import Spec
 from popl_rl.models.population import Population
-from popl_rl.models.schedules import linear_decay
-from popl_rl.models.sets import as_set
 
-__all__ = ["group_weights", "train_cpl"]
+__all__ = ["GroupCPL", "group_weights", "pooled_population", "train"]
 
-_BLOCK = 50  # steps between two changes of the learning rate, and two reports of progress
+_BLOCKS = 30  # generations of a training that nobody looks at in between
 
 
 def group_weights(group: Tensor, num_groups: int) -> Tensor:
@@ -41,61 +38,59 @@ def group_weights(group: Tensor, num_groups: int) -> Tensor:
     return torch.cat([torch.ones(1, len(group)), oracle])
 
 
-def train_cpl(
-    spec: Spec,
-    bank: SegmentBank,
-    comparisons: Comparisons,
-    weight: Tensor,
-    *,
-    steps: int = 1500,
-    batch_size: int = 256,
-    learning_rate: float = 2e-3,
-    alpha: float = 0.5,
-    conservatism: float = 0.9,
-    discount: float = 1.0,
-    population: Population | None = None,
-    generator: torch.Generator,
-    progress: Callable[[int], None] | None = None,
-) -> HypothesisSet:
-    """Train plain CPL policies (arXiv 2310.13639), several at once.
+class GroupCPL(MultiCPL):
+    """CPL hypotheses that draw each comparison as often as they are told to.
 
-    Of reward functions, with ``conservatism=1``, this is Bradley–Terry reward learning as in RLHF
-    (Christiano et al., 2017).
+    With the weights of :func:`group_weights` these are pooled CPL and the oracle of each group, by
+    the recipe of every other method.
 
     Args:
-        spec: Sizes of the policies.
-        bank: Segments.
-        comparisons: M strict preferences.
-        weight: How often each policy draws each preference, ``[K, M]``.
-        steps: Gradient steps.
-        batch_size: Preferences per policy and step.
-        learning_rate: Adam's step size.
-        alpha: Scale of the scores.
-        conservatism: Lambda of the CPL loss.
-        discount: Per-step discount of the scores.
-        population: K policies to start from, changed in place; fresh networks if None.
+        problem: What is to be learnt.
+        weight: How often each of K hypotheses draws each comparison, ``[K, M]``.
         generator: Source of initial weights and batches.
-        progress: Called with the number of steps done.
-
-    Returns:
-        K policies, in the order of ``weight``.
     """
-    if population is None:
-        population = Population.create(spec, len(weight), generator=generator).to(weight.device)
-    loss = CPLLoss(population, bank, alpha=alpha, conservatism=conservatism, discount=discount)
-    optimizer = torch.optim.Adam(population.members.parameters(), lr=learning_rate)
-    schedule = linear_decay(optimizer, -(-steps // _BLOCK))
-    for done in range(0, steps, _BLOCK):
-        descend(
-            loss,
-            optimizer,
-            comparisons,
-            steps=min(_BLOCK, steps - done),
-            batch_size=batch_size,
-            weight=weight,
-            generator=generator,
-        )
-        schedule.step()
+
+    def __init__(self, problem: Problem, *, weight: Tensor, generator: torch.Generator) -> None:
+        population = problem.typical_population(len(weight), generator=generator)
+        super().__init__(problem, population=population, generator=generator)
+        self.weight = weight.to(problem.device)
+
+    def _weights(self, scores: Tensor) -> tuple[Tensor, dict[str, float]]:  # noqa: ARG002
+        return self.weight, {}
+
+    def result(self) -> HypothesisSet:
+        """The K hypotheses, in the order of the weights."""
+        return self.problem.hypothesis_set(self.population)
+
+
+def train(method: Method, *, progress: Callable[[int], None] | None = None) -> HypothesisSet:
+    """Run a method to its end.
+
+    Args:
+        method: What to run, from wherever it is.
+        progress: Called with the number of generations done.
+    """
+    while method.generation < method.generations:
+        method.step()
         if progress is not None:
-            progress(min(done + _BLOCK, steps))
-    return as_set(population, alpha=alpha, discount=discount)
+            progress(method.generation)
+    return method.result()
+
+
+def pooled_population(problem: Problem, *, steps: int, generator: torch.Generator) -> Population:
+    """One hypothesis trained on everybody's answers, from which others may start.
+
+    Args:
+        problem: What is to be learnt.
+        steps: Gradient steps, in the place of the recipe's.
+        generator: Source of initial weights and batches.
+    """
+    short = replace(
+        problem,
+        training=replace(problem.training, steps=steps),
+        generations=min(_BLOCKS, steps),
+    )
+    weight = torch.ones(1, len(problem.comparisons), device=problem.device)
+    method = GroupCPL(short, weight=weight, generator=generator)
+    train(method)
+    return method.population

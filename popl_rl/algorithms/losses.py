@@ -1,7 +1,6 @@
 """The contrastive preference loss, and the loop that descends it for a whole population."""
 
 import torch
-import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives.common import LossModule
@@ -9,11 +8,14 @@ from torchrl.objectives.common import LossModule
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.population import Population
+from popl_rl.models.preference_likelihood import log_likelihood
 
 __all__ = ["CPLLoss", "cpl_loss", "descend"]
 
 
-def cpl_loss(preferred: Tensor, other: Tensor, *, conservatism: float = 1.0) -> Tensor:
+def cpl_loss(
+    preferred: Tensor, other: Tensor, *, conservatism: float = 1.0, slip: float = 0.0
+) -> Tensor:
     """CPL loss of scored pairs, ``-log sigmoid(S(sigma+) - lambda S(sigma-))``.
 
     Equation 6 of CPL (Hejna et al., arXiv 2310.13639). With ``conservatism`` below 1, raising the
@@ -24,11 +26,13 @@ def cpl_loss(preferred: Tensor, other: Tensor, *, conservatism: float = 1.0) -> 
         preferred: Scores of the preferred segments, any shape.
         other: Scores of the others, same shape.
         conservatism: Lambda in (0, 1].
+        slip: Chance that an answer is a slip, in [0, 0.5), see
+            :func:`~popl_rl.models.preference_likelihood.log_likelihood`.
 
     Returns:
         Losses, same shape.
     """
-    return F.softplus(conservatism * other - preferred)
+    return -log_likelihood(preferred - conservatism * other, slip)
 
 
 class CPLLoss(LossModule):
@@ -44,6 +48,7 @@ class CPLLoss(LossModule):
         alpha: Temperature; the scale of the scores.
         conservatism: Lambda in (0, 1].
         discount: Per-step discount gamma.
+        slip: Chance that an answer is a slip.
 
     Raises:
         ValueError: If ``alpha`` is not positive or ``conservatism`` or ``discount`` is outside
@@ -67,6 +72,7 @@ class CPLLoss(LossModule):
         alpha: float = 0.5,
         conservatism: float = 0.9,
         discount: float = 1.0,
+        slip: float = 0.0,
     ) -> None:
         super().__init__()
         if not alpha > 0:
@@ -80,6 +86,7 @@ class CPLLoss(LossModule):
         self.alpha = alpha
         self.conservatism = conservatism
         self.discount = discount
+        self.slip = slip
         self._features: Tensor | None = None
 
     @property
@@ -119,6 +126,22 @@ class CPLLoss(LossModule):
         scores: Tensor = value.view(*segment.shape, -1) @ (self.alpha * self.discount**steps)
         return scores
 
+    def _loss(self, preferred: Tensor, other: Tensor) -> Tensor:
+        return cpl_loss(preferred, other, conservatism=self.conservatism, slip=self.slip)
+
+    def pairs(self, preferred: Tensor, other: Tensor) -> Tensor:
+        """Losses of every member on one batch that all share.
+
+        Args:
+            preferred: Segments that were preferred, ``[B]``.
+            other: Segments that these were preferred to, ``[B]``.
+
+        Returns:
+            ``[N, B]``.
+        """
+        segment = torch.cat([preferred, other]).expand(len(self.population), -1)
+        return self._loss(*self.scores(segment).chunk(2, dim=1))
+
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of one batch per member.
 
@@ -131,7 +154,7 @@ class CPLLoss(LossModule):
         """
         segment = torch.cat([tensordict["preferred"], tensordict["other"]], 1)
         preferred, other = self.scores(segment).chunk(2, dim=1)
-        loss = cpl_loss(preferred, other, conservatism=self.conservatism).mean(1).sum()
+        loss = self._loss(preferred, other).mean(1).sum()
         accuracy = (preferred > other).float().mean(1).detach()
         return TensorDict({"loss_cpl": loss, "accuracy": accuracy}, [])
 

@@ -1,135 +1,84 @@
-"""POPL without rater ids: lexicase selection among teams of policies.
+"""POPL without rater ids: lexicase selection among mixtures of policies.
 
 When nobody knows which preferences came from one person, a single preference says little about
 which policy it speaks for, and selecting single policies on single preferences keeps specialists
-that win a case here and there. So the individual here is a *team*, a small mixture of policies
+that win a case here and there. So the individual here is a small *mixture* of policies
 that together should explain whatever is preferred:
 
     p(preference) = sum_k share_k sigmoid(Delta_k)
 
-Members of a team divide the preferences among themselves by responsibility and train on those they
+Members of a mixture divide the preferences among themselves by responsibility and train on those they
 speak for: EM (Dempster, Laird and Rubin, 1977), as in MaxMin-RLHF (Chakraborty et al., 2024), but
-over policies and without being told how many groups there are. Teams are selected by lexicase on
-small bundles of *held-out* preferences, and the smallest team that is as good as the best is the
+over policies and without being told how many groups there are. Mixtures are selected by lexicase on
+small bundles of *held-out* preferences, and the smallest mixture that is as good as the best is the
 result.
 """
 
 import copy
 import math
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import torch
-import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 from torch import Tensor
 
-from popl_rl.algorithms.losses import CPLLoss, descend
+from popl_rl.algorithms.expectation import Expectation, expect
+from popl_rl.algorithms.losses import CPLLoss, cpl_loss, descend
+from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.variation import inherit_moments
+from popl_rl.config import MixtureSettings
 from popl_rl.data.bank import SegmentBank
-from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.policies import Spec
 from popl_rl.models.population import Population
 from popl_rl.models.schedules import linear_decay
-from popl_rl.models.scoring import margins
-from popl_rl.models.sets import as_set
 from popl_rl.selection.lexicase import lexicase_report
 from popl_rl.selection.mad import mad
 from popl_rl.selection.rules import Selection, report
 
-__all__ = ["MixturePOPL", "MixtureSettings"]
+__all__ = ["MixturePOPL"]
 
+_FINAL_BLOCK = 50  # gradient steps of the final training from one E-step to the next
+
+#: Sizes of the first mixtures, in turn. A start finds all groups in one case of seven or so, so
+#: most mixtures are as small as mixtures can be.
+_SIZES = (2, 2, 2, 3)
 _OUTLIERS = 0.05  # a held-out preference counts as noise with this chance at either end
 
 
-@dataclass(frozen=True)
-class MixtureSettings:
-    """Settings of :class:`MixturePOPL`.
-
-    Attributes:
-        teams: Teams in the population.
-        sizes: Sizes of the first teams, in turn. A start finds all groups in one case of seven or
-            so, so most teams are as small as teams can be.
-        generations: Generations to come.
-        steps: Gradient steps per generation.
-        block: Gradient steps from one look at who speaks for whom to the next.
-        batch_size: Preferences per step, each member's own.
-        learning_rate: Of Adam.
-        alpha: Scale of the scores.
-        conservatism: Lambda of the CPL loss.
-        discount: Per-step discount of the scores.
-        held_out: Share of the preferences that only selection sees.
-        bundle: Held-out preferences per lexicase case.
-        first_selection: Generation after which selection begins. Which start is on the way to the
-            groups does not show before some 600 steps: earlier selection fills the population
-            with copies of another.
-        exchange: Chance that a further child swaps a member with another selected team.
-        removal: Chance that a further child loses a member.
-        polish_steps: Steps of the final, cross-fitted training of the chosen team.
-        polish_batch_size: Preferences per step of that training, the same for all members.
-        polish_alpha: Scale of the scores in it.
-        polish_conservatism: Lambda of the CPL loss in it; 1 for reward functions.
-        folds: Folds of it.
-    """
-
-    teams: int = 24
-    sizes: tuple[int, ...] = (2, 2, 2, 3)
-    generations: int = 24
-    steps: int = 60
-    block: int = 15
-    batch_size: int = 256
-    learning_rate: float = 2e-3
-    alpha: float = 0.5
-    conservatism: float = 0.9
-    discount: float = 1.0
-    held_out: float = 0.2
-    bundle: int = 20
-    first_selection: int = 14
-    exchange: float = 0.15
-    removal: float = 0.15
-    polish_steps: int = 1000
-    polish_batch_size: int = 1000
-    polish_alpha: float = 0.25
-    polish_conservatism: float = 0.8
-    folds: int = 4
-
-
 class MixturePOPL:
-    """Evolves teams of policies; one generation is gradient steps, lexicase, exchange.
+    """Evolves mixtures of policies; one generation is gradient steps, lexicase, exchange.
 
     Args:
-        spec: Sizes of the policies.
-        bank: Segments that the comparisons refer to.
-        comparisons: M strict preferences; their cases are not looked at.
-        settings: See :class:`MixtureSettings`.
-        select: Rule that takes the place of lexicase selection among teams.
+        problem: What is to be learnt; the cases of its comparisons are not looked at.
+        settings: Sizes and steps.
+        select: Rule that takes the place of lexicase selection among mixtures.
         generator: Source of all randomness.
 
     Attributes:
         generation: Generations done so far.
-        population: ``teams * max(sizes)`` policies, team after team.
-        active: Which of a team's places are taken, ``[teams, max(sizes)]`` bool.
-        share: What share of the preferences each member speaks for, ``[teams, max(sizes)]``.
+        generations: Generations after which it is finished.
+        population: ``mixtures * places`` policies, mixture after mixture.
+        active: Which of a mixture's places are taken, ``[mixtures, places]`` bool.
+        share: What share of the preferences each member speaks for, ``[mixtures, places]``.
+
+    Raises:
+        ValueError: If there are too few preferences to hold some out.
     """
 
     def __init__(
         self,
-        spec: Spec,
-        bank: SegmentBank,
-        comparisons: Comparisons,
+        problem: Problem,
         *,
         settings: MixtureSettings,
         select: Selection | None = None,
         generator: torch.Generator,
     ) -> None:
-        self.select = select
-        self.spec, self.bank, self.settings = spec, bank, settings
-        self.comparisons, self.generator = comparisons, generator
-        self.generation = 0
-        self.alpha, self.discount = settings.alpha, settings.discount
-        self._counts = _visit_counts(bank, spec, settings.discount)
-        device = bank.row.device
-        places = max(settings.sizes)
+        self.problem, self.settings = problem, settings
+        self.select, self.generator = select, generator
+        self.generation, self.generations = 0, settings.generations
+        self._counts = _visit_counts(problem.bank, problem.spec, problem.training.discount)
+        device, comparisons = problem.device, problem.comparisons
         order = self._permutation(len(comparisons))
         cut = int(settings.held_out * len(comparisons))
         if cut < settings.bundle:
@@ -137,26 +86,28 @@ class MixturePOPL:
                 f"preferences must be enough to hold {settings.bundle} out of "
                 f"{settings.held_out:.0%}, got {len(comparisons)}; collect more answers"
             )
-        self.held, self.train = comparisons.rows(order[:cut]), comparisons.rows(order[cut:])
-        sizes = [settings.sizes[team % len(settings.sizes)] for team in range(settings.teams)]
+        self.held, self.train = (
+            replace(problem, comparisons=comparisons.rows(part))
+            for part in (order[:cut], order[cut:])
+        )
+        places = max(_SIZES)
+        sizes = [_SIZES[mixture % len(_SIZES)] for mixture in range(settings.mixtures)]
         taken = torch.tensor(sizes, device=device).unsqueeze(1)
         self.active = torch.arange(places, device=device) < taken
         self.share = self.active / taken
-        count = settings.teams * places
-        self.population = Population.create(spec, count, generator=generator).to(device)
-        self.loss, self.optimizer = self._trainer(
-            self.population, settings.alpha, settings.conservatism
-        )
+        count = settings.mixtures * places
+        self.population = Population.create(problem.spec, count, generator=generator).to(device)
+        self.loss, self.optimizer = self._trainer(self.population)
 
     def step(self) -> dict[str, float]:
         """Run one generation.
 
         Returns:
             Scalars to log: ``worst_rater_accuracy`` (share of held-out preferences that some
-            member of the best team passes), ``mean_accuracy`` of all members on them,
-            ``held_out_likelihood`` of the best team (mean log),
-            ``selection_depth``, ``distinct`` teams, ``effective_parents``, ``team_size`` of the
-            best team and ``loss``.
+            member of the best mixture passes), ``mean_accuracy`` of all members on them,
+            ``held_out_likelihood`` of the best mixture (mean log),
+            ``selection_depth``, ``distinct`` mixtures, ``effective_parents``, ``mixture_size`` of the
+            best mixture and ``loss``.
         """
         settings = self.settings
         value = math.nan
@@ -164,35 +115,35 @@ class MixturePOPL:
             value = descend(
                 self.loss,
                 self.optimizer,
-                self.train,
+                self.train.comparisons,
                 steps=min(settings.block, settings.steps - done),
-                batch_size=settings.batch_size,
+                batch_size=self.problem.training.batch_size,
                 # Nobody speaks for nothing: an empty place needs something to draw.
                 weight=self._responsibility() + 1e-6,
                 generator=self.generator,
             )
         self.generation += 1
-        held, robust = self._held_out()
+        passes, robust = self._held_out()
         best = int(robust.mean(1).argmax())
-        passed = (held.unflatten(0, self.active.shape) > 0) & self.active.unsqueeze(-1)
+        passed = passes.unflatten(0, self.active.shape) & self.active.unsqueeze(-1)
         metrics = {
             "worst_rater_accuracy": float(passed[best].any(0).float().mean()),
             "mean_accuracy": float(passed[self.active].float().mean()),
             "held_out_likelihood": float(robust[best].mean()),
             "selection_depth": 0.0,
-            "distinct": float(settings.teams),
-            "effective_parents": float(settings.teams),
-            "team_size": float(self.active[best].sum()),
+            "distinct": float(settings.mixtures),
+            "effective_parents": float(settings.mixtures),
+            "mixture_size": float(self.active[best].sum()),
             "loss": value,
         }
         if settings.first_selection <= self.generation < settings.generations:
             cases = self._bundles(robust)
             if self.select is None:
                 selected = lexicase_report(
-                    cases, settings.teams, epsilon=mad(cases), generator=self.generator
+                    cases, settings.mixtures, epsilon=mad(cases), generator=self.generator
                 )
             else:
-                chosen = self.select(cases, settings.teams, generator=self.generator)
+                chosen = self.select(cases, settings.mixtures, generator=self.generator)
                 selected = report(cases, chosen)
             self._replace(selected.parents)
             metrics["selection_depth"] = float(selected.depth.float().mean())
@@ -200,79 +151,77 @@ class MixturePOPL:
             metrics["effective_parents"] = selected.effective
         return metrics
 
-    def policies(self) -> HypothesisSet:
-        """Choose the smallest team as good as the best, and polish it."""
+    def result(self) -> HypothesisSet:
+        """The smallest mixture that is as good as the best, trained once more and scaled."""
         _, robust = self._held_out()
         behind = robust[robust.mean(1).argmax()] - robust
-        # One-standard-error rule: a bigger team has to earn its members.
+        # One-standard-error rule: a bigger mixture has to earn its members.
         error = behind.std(1) / behind.shape[1] ** 0.5
         size = self.active.sum(1)
         good = behind.mean(1) <= error
         smallest = good & (size == size[good].min())
-        team = int(torch.where(smallest, robust.mean(1), -torch.inf).argmax())
-        member = self.active[team].nonzero().squeeze(-1) + team * self.active.shape[1]
-        share = self.share[team][self.active[team]]
-        return self._polish(self.population.subset(member), share)
+        chosen = int(torch.where(smallest, robust.mean(1), -torch.inf).argmax())
+        places = self.active.shape[1]
+        member = self.active[chosen].nonzero().squeeze(-1) + chosen * places
+        share = self.share[chosen][self.active[chosen]]
+        final = self._train_finally(self.population.subset(member), share)
+        found = self.problem.hypothesis_set(final)
+        found.origin = []  # trained on, they are no longer members of the population
+        return found
 
-    def _polish(self, team: Population, share: Tensor) -> HypothesisSet:
-        """Train a team on, with responsibilities that nobody gave to their own training data.
+    def _train_finally(self, members: Population, share: Tensor) -> Population:
+        """Train a mixture on, with responsibilities that nobody gave to their own training data.
 
-        ``folds + 1`` copies of the team train side by side. Copy f leaves fold f out and tells
+        ``folds + 1`` copies of the mixture train side by side. Copy f leaves fold f out and tells
         whom the preferences of fold f belong to; the last copy trains on everything. Without this
         every member would confirm what it has learnt by heart.
         """
-        settings, everything = self.settings, self.comparisons
-        count, size = len(everything), len(team)
+        settings, everything = self.settings, self.problem.comparisons
+        count, size = len(everything), len(members)
         fold = self._permutation(count) % settings.folds
         row = torch.arange(count, device=fold.device)
-        copies = team.subset(list(range(size)) * (settings.folds + 1))
-        loss, optimizer = self._trainer(copies, settings.polish_alpha, settings.polish_conservatism)
-        block = 50
-        schedule = linear_decay(optimizer, -(-settings.polish_steps // block))
+        copies = members.subset(list(range(size)) * (settings.folds + 1))
+        loss, optimizer = self._trainer(copies)
+        blocks = -(-settings.final_steps // _FINAL_BLOCK)
+        schedule = linear_decay(optimizer, blocks)
         use = torch.ones(settings.folds + 1, count, device=fold.device)
         use[fold, row] = 0.0
         use = use * count / use.sum(1, keepdim=True)
-        log_share = share.clamp(min=1e-3).log().unsqueeze(-1)
-        for _ in range(-(-settings.polish_steps // block)):
-            margin = margins(
-                copies, self.bank, everything, alpha=settings.polish_alpha, discount=self.discount
-            )
-            log_odds = F.logsigmoid(margin).unflatten(0, (settings.folds + 1, size))
-            responsibility = (log_odds + log_share).softmax(1)[fold, :, row].T
-            for _ in range(block):
-                index = self._draw(everything)
-                contrast = self._batch_margins(loss, index)
+        shares = share.expand(settings.folds + 1, -1)
+        for _ in range(blocks):
+            likelihood = self._likelihood(self.problem, copies)
+            belongs = expect(likelihood.unflatten(0, (settings.folds + 1, size)), shares)
+            responsibility = belongs.responsibility[fold, :, row].T
+            for _ in range(_FINAL_BLOCK):
+                index = self._draw(count)
+                losses = self._shared_losses(loss, index)
                 weight = (use[:, None, index] * responsibility[:, index]).flatten(0, 1)
-                _descend((F.softplus(-contrast) * weight).mean(1).sum(), optimizer)
+                optimizer.zero_grad(set_to_none=True)
+                (losses * weight).mean(1).sum().backward()  # type: ignore[no-untyped-call]
+                optimizer.step()
             schedule.step()
-        refined = copies.subset(list(range(settings.folds * size, len(copies))))
-        policies = as_set(refined, alpha=settings.polish_alpha, discount=self.discount)
-        policies.origin = []  # trained on, they are no longer members of the population
-        return policies
+        return copies.subset(list(range(settings.folds * size, len(copies))))
+
+    @staticmethod
+    def _likelihood(problem: Problem, population: Population) -> Tensor:
+        """Log-likelihood of the answers of a problem under every member, ``[N, M]``."""
+        return problem.likelihood(problem.scores(population))
 
     def _held_out(self) -> tuple[Tensor, Tensor]:
-        """Margins ``[N, H]`` and robust log-likelihoods ``[teams, H]`` of held-out preferences."""
-        held = margins(
-            self.population, self.bank, self.held, alpha=self.alpha, discount=self.discount
-        )
-        likelihood = self._explain(F.logsigmoid(held)).exp()
-        return held, (_OUTLIERS + (1 - 2 * _OUTLIERS) * likelihood).log()
+        """Passes ``[N, H]`` and robust log-likelihoods ``[mixtures, H]`` of held-out preferences."""
+        scores, held = self.held.scores(self.population), self.held.comparisons
+        passes = scores[:, held.preferred] > scores[:, held.other]
+        likelihood = self._expect(self.held.likelihood(scores)).evidence.exp()
+        return passes, (_OUTLIERS + (1 - 2 * _OUTLIERS) * likelihood).log()
 
-    def _explain(self, log_odds: Tensor) -> Tensor:
-        """Log-likelihood of preferences under each team, ``[N, B] -> [teams, B]``."""
-        log_share = self.share.clamp(min=1e-3).log()
-        log_share = log_share.masked_fill(~self.active, -torch.inf).unsqueeze(-1)
-        explained: Tensor = log_odds.unflatten(0, self.active.shape) + log_share
-        return explained.logsumexp(1)
+    def _expect(self, likelihood: Tensor) -> Expectation:
+        """E-step of every mixture; each preference is a case of its own."""
+        each = likelihood.unflatten(0, self.active.shape)
+        return expect(each, self.share, active=self.active)
 
     def _responsibility(self) -> Tensor:
-        """Whom each member speaks for (the E-step), ``[N, M]``; shares become its means."""
-        margin = margins(
-            self.population, self.bank, self.train, alpha=self.alpha, discount=self.discount
-        )
-        log_odds = F.logsigmoid(margin).unflatten(0, self.active.shape)
-        log_share = self.share.clamp(min=1e-3).log().masked_fill(~self.active, -torch.inf)
-        belongs: Tensor = (log_odds + log_share.unsqueeze(-1)).softmax(1)
+        """Whom each member speaks for, ``[N, M]``; shares become its means."""
+        belongs = self._expect(self._likelihood(self.train, self.population)).responsibility
         self.share = belongs.mean(2)
         return belongs.flatten(0, 1)
 
@@ -305,35 +254,27 @@ class MixturePOPL:
         self.population.replace_(source.flatten())
         inherit_moments(self.optimizer, source.flatten())
 
-    def _trainer(
-        self, population: Population, alpha: float, conservatism: float
-    ) -> tuple[CPLLoss, torch.optim.Adam]:
-        loss = CPLLoss(
-            population,
-            self.bank,
-            alpha=alpha,
-            conservatism=conservatism,
-            discount=self.settings.discount,
+    def _trainer(self, population: Population) -> tuple[CPLLoss, torch.optim.Adam]:
+        rate = self.problem.training.learning_rate
+        return self.problem.loss(population), torch.optim.Adam(
+            population.members.parameters(), lr=rate
         )
-        rate = self.settings.learning_rate
-        return loss, torch.optim.Adam(population.members.parameters(), lr=rate)
 
-    def _batch_margins(self, loss: CPLLoss, index: Tensor) -> Tensor:
-        """Conservative margins of every member on one shared batch, ``[N, B]``."""
-        preferred, other = self.comparisons.preferred[index], self.comparisons.other[index]
+    def _shared_losses(self, loss: CPLLoss, index: Tensor) -> Tensor:
+        """Losses of every member on one shared batch, ``[N, B]``."""
+        comparisons = self.problem.comparisons
+        preferred, other = comparisons.preferred[index], comparisons.other[index]
         if self._counts is None:
-            segment = torch.cat([preferred, other]).expand(len(loss.population), -1)
-            better, worse = loss.scores(segment).chunk(2, dim=1)
-            return better - loss.conservatism * worse
+            return loss.pairs(preferred, other)
         # All members see the same batch of few distinct observations: one matrix product.
-        table = self.spec.table(loss.population(self.bank.observation)).flatten(1)
-        contrast = self._counts[preferred] - loss.conservatism * self._counts[other]
-        batch: Tensor = loss.alpha * table @ contrast.T
-        return batch
+        output = loss.population(self.problem.bank.observation)
+        table = loss.alpha * self.problem.spec.table(output).flatten(1)
+        better, worse = table @ self._counts[preferred].T, table @ self._counts[other].T
+        return cpl_loss(better, worse, conservatism=loss.conservatism, slip=loss.slip)
 
-    def _draw(self, comparisons: Comparisons) -> Tensor:
-        shape, device = (self.settings.polish_batch_size,), comparisons.preferred.device
-        return torch.randint(len(comparisons), shape, generator=self.generator, device=device)
+    def _draw(self, count: int) -> Tensor:
+        shape, device = (self.settings.final_batch_size,), self.generator.device
+        return torch.randint(count, shape, generator=self.generator, device=device)
 
     def _permutation(self, count: int) -> Tensor:
         return torch.randperm(count, generator=self.generator, device=self.generator.device)
@@ -374,9 +315,3 @@ def _visit_counts(bank: SegmentBank, spec: Spec, discount: float) -> Tensor | No
     weight = (discount**steps).float().expand(bank.row.shape)
     counts = torch.zeros(len(bank), cells, device=bank.row.device)
     return counts.scatter_add(1, bank.row * spec.action_dim + bank.action, weight)
-
-
-def _descend(loss: Tensor, optimizer: torch.optim.Optimizer) -> None:
-    optimizer.zero_grad(set_to_none=True)
-    loss.backward()  # type: ignore[no-untyped-call]
-    optimizer.step()

@@ -1,82 +1,81 @@
-"""Several CPL policies side by side, each trained on everybody's answers."""
+"""Several CPL hypotheses side by side, each trained on comparisons that it draws by its weights."""
 
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.variation import GradientCPL
-from popl_rl.data.bank import SegmentBank
-from popl_rl.data.comparisons import Comparisons
+from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.population import Population
-from popl_rl.models.scoring import case_values, margins, rater_accuracy
+from popl_rl.models.scoring import case_values, rater_accuracy
 
 __all__ = ["MultiCPL"]
 
 
 class MultiCPL:
-    """Pooled CPL (arXiv 2310.13639) from several initial weights: an ensemble without selection.
+    """CPL (arXiv 2310.13639) from several initial weights: an ensemble without selection.
 
-    What POPL's set has to beat by more than its size: policies that differ by chance alone. With a
-    single member it is pooled CPL.
+    What POPL's set has to beat by more than its size: hypotheses that differ by chance alone. With
+    a single member it is pooled CPL. Of reward functions this is Bradley–Terry reward learning as
+    in RLHF (Christiano et al., 2017).
 
     Args:
-        population: N policies with different initial weights, changed in place.
-        bank: Segments that the comparisons refer to.
-        comparisons: M strict preferences and the case of each.
-        training: The loop that trains the policies, a block of CPL steps for each generation; its
-            loss tells the scale and the discount of the scores.
-        generator: Source of all randomness, the one that ``training`` draws from.
+        problem: What is to be learnt.
+        population: Members to start from, changed in place; ``problem.members`` fresh ones if None.
+        generator: Source of all randomness.
 
     Attributes:
         generation: Generations done so far.
-        alpha: Scale of the scores.
-        discount: Per-step discount of the scores.
+        generations: Generations after which it is finished.
+        population: The hypotheses as they are now.
     """
 
     def __init__(
         self,
-        population: Population,
-        bank: SegmentBank,
-        comparisons: Comparisons,
+        problem: Problem,
         *,
-        training: GradientCPL,
+        population: Population | None = None,
         generator: torch.Generator,
     ) -> None:
+        if population is None:
+            population = problem.initial_population(problem.members, generator=generator)
+        self.problem = problem
         self.population = population
-        self.bank = bank
-        self.comparisons = comparisons
-        self.training = training
-        self.alpha, self.discount = training.loss.alpha, training.loss.discount
+        self.training = GradientCPL.of(problem, population, generator=generator)
         self.generator = generator
         self.generation = 0
+        self.generations = problem.generations
 
     def step(self) -> dict[str, float]:
-        """Run one generation: judge the policies, then train them.
+        """Run one generation: evaluate the hypotheses, then train them.
 
         Returns:
             Scalars to log: ``worst_rater_accuracy`` (10 % quantile over cases of the best member's
             accuracy) and ``mean_accuracy``, both as the generation found them, and ``loss_cpl``.
         """
-        margin = margins(
-            self.population, self.bank, self.comparisons, alpha=self.alpha, discount=self.discount
-        )
-        weight, about = self._weights(margin)
+        scores, comparisons = self.problem.scores(self.population), self.problem.comparisons
+        passes = scores[:, comparisons.preferred] > scores[:, comparisons.other]
+        weight, about = self._weights(scores)
         # Everybody is the one child of itself.
-        itself = torch.arange(len(self.population), device=margin.device)
+        itself = torch.arange(len(self.population), device=weight.device)
         trained = self.training(itself, weight)
         self.generation += 1
-        passes = margin > 0
         return {
-            "worst_rater_accuracy": rater_accuracy(case_values(passes, self.comparisons)),
+            "worst_rater_accuracy": rater_accuracy(case_values(passes, comparisons)),
             "mean_accuracy": float(passes.float().mean()),
             **about,
             **trained,
         }
 
-    def _weights(self, margin: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """How often each policy draws each comparison, ``[N, M]``, and scalars to log."""
-        return torch.ones_like(margin), {}
+    def _weights(self, scores: Tensor) -> tuple[Tensor, dict[str, float]]:
+        """How often each member draws each comparison, ``[N, M]``, and scalars to log."""
+        return scores.new_ones(len(scores), len(self.problem.comparisons)), {}
+
+    def result(self) -> HypothesisSet:
+        """One member for each distinct behaviour, its scale fitted for catering."""
+        return self.problem.calibrated(self.problem.distinct(self.population))
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the next generation depends on."""

@@ -9,18 +9,19 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from popl_rl.algorithms.refinement import RefinementSettings
+from popl_rl.algorithms.problem import Problem
+from popl_rl.algorithms.refinement import refine
 from popl_rl.algorithms.variation import Variation
-from popl_rl.data.bank import SegmentBank
-from popl_rl.data.comparisons import Comparisons
+from popl_rl.config import RefinementSettings
+from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.population import Population
-from popl_rl.models.scoring import case_values, margins, rater_accuracy
+from popl_rl.models.scoring import case_values, rater_accuracy
 from popl_rl.selection.downsampling import spread_out
 from popl_rl.selection.lexicase import SelectionReport, lexicase_given_first, lexicase_report
 from popl_rl.selection.mad import mad
 from popl_rl.selection.rules import Selection, report
 
-#: What a child learns from kin on whom its parent is weak, against 1 where it is strong. Without
+#: What a child learns from similar raters on whom its parent is weak, against 1 where it is strong. Without
 #: it a first child for a small group learns from the one or two raters that its parent happens to
 #: pass; much more of it blurs groups that are each other's nearest.
 _FLOOR = 0.2
@@ -29,57 +30,51 @@ __all__ = ["POPL"]
 
 
 class POPL:
-    """One generation after the other: score, select, vary.
+    """One generation after the other: score, select, vary; at the end, refine.
 
     Args:
-        population: N policies, changed in place.
-        bank: Segments that the comparisons refer to.
-        comparisons: M strict preferences and the case of each.
+        problem: What is to be learnt.
+        population: N members, changed in place.
         variation: How children differ from their parents.
-        alpha: Scale of the scores, as in the CPL loss.
-        discount: Per-step discount of the scores.
         epsilon: Tolerance of lexicase selection; ``"mad"``, a number, or None for none.
-        similarity: How alike the raters want, ``[C, C]`` in [-1, 1] (see :mod:`popl_rl.algorithms.rater_similarity`). If
-            given, a child is selected for one rater, whose case comes first in its order, and
-            learns from raters akin to that one. Half of these raters are random, the others unlike
-            each other, so that small groups are not overlooked.
+        similarity: How alike the raters want, ``[C, C]`` in [-1, 1] (see
+            :mod:`popl_rl.algorithms.rater_similarity`). If given, a child is selected for one
+            rater, whose case comes first in its order, and learns from raters like that one. Half
+            of these raters are random, the others unlike each other, so that small groups are not
+            overlooked.
         select: Rule that takes the place of lexicase selection; for whom children are, and what
             they learn, stays as it is.
-        refinement: How what has been found is to be trained when all generations are done (see
-            :mod:`popl_rl.algorithms.refinement`); None to keep every distinct member as it is.
+        refinement: How what has been found is to be trained when all generations are done; None to
+            keep every distinct member as it is.
         generator: Source of all randomness.
 
     Attributes:
         generation: Generations done so far.
+        generations: Generations after which it is finished.
     """
 
     def __init__(
         self,
-        population: Population,
-        bank: SegmentBank,
-        comparisons: Comparisons,
+        problem: Problem,
         *,
+        population: Population,
         variation: Variation,
-        alpha: float = 0.5,
-        discount: float = 1.0,
         epsilon: float | Literal["mad"] | None = "mad",
         similarity: Tensor | None = None,
         select: Selection | None = None,
         refinement: RefinementSettings | None = None,
         generator: torch.Generator,
     ) -> None:
+        self.problem = problem
         self.population = population
-        self.bank = bank
-        self.comparisons = comparisons
         self.variation = variation
-        self.alpha = alpha
-        self.discount = discount
         self.epsilon = epsilon
         self.similarity = similarity
         self.select = select
         self.refinement = refinement
         self.generator = generator
         self.generation = 0
+        self.generations = problem.generations
 
     def step(self) -> dict[str, float]:
         """Run one generation.
@@ -89,11 +84,9 @@ class POPL:
             member's accuracy), ``mean_accuracy``, ``selection_depth`` (cases used per selection),
             ``distinct`` and ``effective_parents``, and what the variation reports.
         """
-        margin = margins(
-            self.population, self.bank, self.comparisons, alpha=self.alpha, discount=self.discount
-        )
-        passes = margin > 0
-        values = case_values(passes, self.comparisons)
+        comparisons = self.problem.comparisons
+        passes = self.problem.margins(self.population) > 0
+        values = case_values(passes, comparisons)
         tolerance = mad(values) if self.epsilon == "mad" else self.epsilon
         strong = values >= values.amax(0) - (0.0 if tolerance is None else tolerance)
         first = None if self.similarity is None else self._first_raters(self.similarity)
@@ -101,7 +94,7 @@ class POPL:
         strength = strong.float()[selected.parents]
         if self.similarity is not None and first is not None:
             strength = (strength + _FLOOR) * self.similarity[first].clamp(min=0)
-        varied = self.variation(selected.parents, strength[:, self.comparisons.case])
+        varied = self.variation(selected.parents, strength[:, comparisons.case])
         self.generation += 1
         return {
             "worst_rater_accuracy": rater_accuracy(values),
@@ -129,6 +122,17 @@ class POPL:
         device = self.generator.device
         first = torch.randint(len(similarity), shape, generator=self.generator, device=device)
         return torch.cat([first, spread_out(similarity, spread, generator=self.generator)])
+
+    def result(self) -> HypothesisSet:
+        """The refined members, or one member for each behaviour, scaled for catering."""
+        if self.refinement is None:
+            return self.problem.calibrated(self.problem.distinct(self.population))
+        refined = refine(
+            self.problem, self.population, settings=self.refinement, generator=self.generator
+        )
+        found = self.problem.hypothesis_set(refined)
+        found.origin = []  # trained on, they are no longer members of the population
+        return self.problem.calibrated(found)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the next generation depends on."""

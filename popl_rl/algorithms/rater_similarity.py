@@ -49,6 +49,7 @@ def specialists(
         alpha=loss.alpha,
         conservatism=loss.conservatism,
         discount=loss.discount,
+        slip=loss.slip,
     )
     descend(
         own,

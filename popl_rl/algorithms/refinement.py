@@ -1,62 +1,29 @@
 """From an evolved population to the few policies that people get: which to keep, one last training.
 
 Selection finds out who there is. What it leaves is many members that serve the same raters nearly
-alike, each trained on whatever it was selected for last. :func:`smallest_team` keeps as few as
+alike, each trained on whatever it was selected for last. :func:`smallest_subset` keeps as few as
 predict the raters as well as more of them do, and :func:`refine` trains each on those whom it
 serves: EM (Dempster, Laird and Rubin, 1977) from where evolution has ended, which has also told it
 how many there are.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from popl_rl.algorithms.expectation import expect
 from popl_rl.algorithms.losses import CPLLoss
-from popl_rl.data.bank import SegmentBank
+from popl_rl.algorithms.problem import Problem
+from popl_rl.config import RefinementSettings
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.population import Population
-from popl_rl.models.preference_likelihood import MISTAKE, leave_one_out, log_likelihood, per_case
-from popl_rl.models.scoring import segment_scores
+from popl_rl.models.preference_likelihood import leave_one_out, per_case
 
-__all__ = [
-    "RefinementSettings",
-    "predictive",
-    "refine",
-    "smallest_team",
-]
+__all__ = ["predictive", "refine", "smallest_subset"]
 
 _CUTS = (0.2, 0.4)  # of the steps, after which members that nobody needs are dropped
-
-
-@dataclass(frozen=True)
-class RefinementSettings:
-    """Settings of :func:`refine`.
-
-    Attributes:
-        steps: Gradient steps.
-        block: Steps from one look at who serves whom to the next.
-        batch_size: Preferences per step, the same for all members.
-        learning_rate: Of Adam; held for half of the steps, then it falls to zero.
-        alpha: Scale of the scores. A smaller one makes sharper policies of the same margins.
-        conservatism: Lambda of the CPL loss. A smaller one keeps policies nearer to what was
-            preferred: they act better, and rank a little worse.
-        discount: Per-step discount of the scores.
-        mistake: Chance that an answer is a slip, in [0, 0.5).
-        folds: Folds of the cross-fitting, at least 2.
-        most: Members to begin with, at most.
-    """
-
-    steps: int = 1500
-    block: int = 50
-    batch_size: int = 256
-    learning_rate: float = 2e-3
-    alpha: float = 0.25
-    conservatism: float = 0.8
-    discount: float = 1.0
-    mistake: float = MISTAKE
-    folds: int = 4
-    most: int = 8
+_LOOKS = 30  # E-steps, one before each block of gradient steps
 
 
 def predictive(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
@@ -74,122 +41,146 @@ def predictive(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
     return mean
 
 
-def smallest_team(likelihood: Tensor, comparisons: Comparisons, *, most: int = 8) -> list[int]:
+def smallest_subset(likelihood: Tensor, comparisons: Comparisons, *, most: int = 8) -> list[int]:
     """As few members as predict the raters as well as more of them do.
 
     Members are added one after the other, each time the one that helps :func:`predictive` most.
-    Of these nested teams the smallest within one standard error of the best is taken (Breiman et
+    Of these nested subsets the smallest within one standard error of the best is taken (Breiman et
     al., 1984): a further member has to earn its place.
 
     Args:
         likelihood: Log-likelihood of every comparison under every member, ``[N, M]``.
         comparisons: The M comparisons and the case of each.
-        most: Size of the largest team.
+        most: Size of the largest subset.
 
     Returns:
         Members, the most useful one first.
     """
-    team: list[int] = []
+    chosen: list[int] = []
     values = []
     for _ in range(min(most, len(likelihood))):
-        rest = [member for member in range(len(likelihood)) if member not in team]
-        each = torch.stack([predictive(likelihood[[*team, one]], comparisons) for one in rest])
+        rest = [member for member in range(len(likelihood)) if member not in chosen]
+        each = torch.stack([predictive(likelihood[[*chosen, one]], comparisons) for one in rest])
         best = int(each.mean(1).argmax())
-        team.append(rest[best])
+        chosen.append(rest[best])
         values.append(each[best])
     value = torch.stack(values)
     behind = value[value.mean(1).argmax()] - value
     # A single case has no spread to judge by.
     error = behind.std(1, correction=0) / behind.shape[1] ** 0.5
     good = behind.mean(1) <= error
-    return team[: int(good.float().argmax()) + 1]
+    return chosen[: int(good.float().argmax()) + 1]
 
 
 def refine(
+    problem: Problem,
     population: Population,
-    bank: SegmentBank,
-    comparisons: Comparisons,
     *,
-    alpha: float,
     settings: RefinementSettings,
     generator: torch.Generator,
 ) -> Population:
-    """Choose a team of members and train each on the raters whom it serves.
+    """Choose a few members and train each on the raters whom it serves.
 
-    ``folds + 1`` copies of the team train side by side. Copy f leaves the cases of fold f out and
-    tells who serves them; the last copy trains on everything and is the result. Without this every
-    member would confirm what it has learnt by heart. The same held-out likelihoods tell, twice
-    in the first half, which members nobody needs.
+    ``folds + 1`` copies of the chosen members train side by side. Copy f leaves the cases of fold f
+    out and tells who serves them; the last copy trains on everything and is the result. Without
+    this every member would confirm what it has learnt by heart. The same held-out likelihoods tell,
+    twice in the first half, which members nobody needs.
+
+    The E-step and the gradient steps maximise one likelihood, that of answers with slips on CPL's
+    conservative margins ``S(sigma+) - lambda S(sigma-)``, under the recipe of the problem.
 
     Args:
+        problem: What is to be learnt; batches are shared by all members.
         population: N evolved members; copied.
-        bank: Segments.
-        comparisons: M strict preferences and the case of each.
-        alpha: Scale of the scores that the population was evolved with.
-        settings: See :class:`RefinementSettings`.
+        settings: Steps, folds and the most members to begin with.
         generator: Source of folds and batches.
 
     Returns:
         At most ``settings.most`` members.
-
-    Raises:
-        ValueError: If ``settings.mistake`` is outside [0, 0.5).
     """
-    folds, device = settings.folds, generator.device
-    fold = torch.randperm(comparisons.num_cases, generator=generator, device=device) % folds
-    case = torch.arange(comparisons.num_cases, device=device)
-    row = torch.arange(len(comparisons), device=device)
-    use = torch.ones(folds + 1, len(comparisons), device=device)
-    use[fold[comparisons.case], row] = 0.0
-
-    def explained(members: Population, scale: float) -> Tensor:
-        scores = segment_scores(members, bank, alpha=scale, discount=settings.discount)
-        margin = scores[:, comparisons.preferred] - scores[:, comparisons.other]
-        return log_likelihood(margin, settings.mistake)
-
-    team = smallest_team(explained(population, alpha), comparisons, most=settings.most)
-    copies = population.subset(team * (folds + 1))
-    loss, optimizer = _trainer(copies, bank, settings)
-    share = torch.full((len(team),), 1 / len(team), device=device)
-    blocks = -(-settings.steps // settings.block)
-    cuts = [int(cut * blocks) for cut in _CUTS]
-    for block in range(blocks):
-        likelihood = explained(copies, settings.alpha).unflatten(0, (folds + 1, -1))
+    training = _CrossFitting(problem, population, settings, generator)
+    blocks = min(_LOOKS, settings.steps)
+    steps = [settings.steps * (block + 1) // blocks for block in range(blocks)]
+    cuts = {int(cut * blocks) for cut in _CUTS}
+    for block, (begin, end) in enumerate(zip([0, *steps[:-1]], steps, strict=True)):
         if block in cuts:
-            held_out = likelihood[fold[comparisons.case], :, row].T
-            kept = sorted(smallest_team(held_out, comparisons))
-            likelihood, share = likelihood[:, kept], share[kept]
-            index = torch.arange(len(copies), device=device).view(folds + 1, -1)[:, kept]
-            copies = copies.subset(index.flatten())
-            loss, optimizer = _trainer(copies, bank, settings)
-        # The E-step, with the chance of each member as it was before.
-        joint = per_case(likelihood, comparisons) + share.clamp(min=1e-3).log().unsqueeze(-1)
-        served = joint.softmax(1)[fold, :, case].T
-        share = served.mean(1)
-        weight = (use.unsqueeze(1) * served[:, comparisons.case]).flatten(0, 1)
-        optimizer.param_groups[0]["lr"] = settings.learning_rate * min(1, 2 - 2 * block / blocks)
-        for _ in range(min(settings.block, settings.steps - block * settings.block)):
-            shape = (settings.batch_size,)
-            index = torch.randint(len(comparisons), shape, generator=generator, device=device)
-            preferred = comparisons.preferred[index].expand(len(copies), -1)
-            other = comparisons.other[index].expand(len(copies), -1)
-            better, worse = loss.scores(torch.cat([preferred, other], 1)).chunk(2, dim=1)
-            fit = log_likelihood(better - settings.conservatism * worse, settings.mistake)
-            optimizer.zero_grad(set_to_none=True)
-            (-(fit * weight[:, index]).mean(1).sum()).backward()  # type: ignore[no-untyped-call]
-            optimizer.step()
-            copies.constrain_()
-    return copies.subset(range(len(copies) - len(share), len(copies)))
+            training.drop()
+        training.expect()
+        # The learning rate is held for half of the blocks, then falls to zero.
+        training.descend(end - begin, rate=min(1.0, 2 - 2 * block / blocks))
+    return training.result()
 
 
-def _trainer(
-    population: Population, bank: SegmentBank, settings: RefinementSettings
-) -> tuple[CPLLoss, torch.optim.Adam]:
-    loss = CPLLoss(
-        population,
-        bank,
-        alpha=settings.alpha,
-        conservatism=settings.conservatism,
-        discount=settings.discount,
-    )
-    return loss, torch.optim.Adam(population.members.parameters(), lr=settings.learning_rate)
+class _CrossFitting:
+    """``folds + 1`` copies of a few members, each but the last without one fold of the cases."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        population: Population,
+        settings: RefinementSettings,
+        generator: torch.Generator,
+    ) -> None:
+        self.problem, self.generator = problem, generator
+        comparisons, device = problem.comparisons, problem.device
+        self.folds = settings.folds
+        order = torch.randperm(comparisons.num_cases, generator=generator, device=device)
+        self.fold = order % settings.folds
+        self.case = torch.arange(comparisons.num_cases, device=device)
+        self.row = torch.arange(len(comparisons), device=device)
+        self.use = torch.ones(settings.folds + 1, len(comparisons), device=device)
+        self.use[self.fold[comparisons.case], self.row] = 0.0
+        chosen = smallest_subset(self._likelihood(population), comparisons, most=settings.most)
+        self.share = torch.full((len(chosen),), 1 / len(chosen), device=device)
+        self._train(population.subset(chosen * (settings.folds + 1)))
+        self.weight = torch.ones(len(self.copies), len(comparisons), device=device)
+
+    def _train(self, copies: Population) -> None:
+        self.copies = copies
+        self.loss: CPLLoss = self.problem.loss(copies)
+        rate = self.problem.training.learning_rate
+        self.optimizer = torch.optim.Adam(copies.members.parameters(), lr=rate)
+
+    def _likelihood(self, population: Population) -> Tensor:
+        """Log-likelihood of every comparison under every member, ``[N, M]``."""
+        return self.problem.likelihood(self.problem.scores(population))
+
+    def _by_copy(self) -> Tensor:
+        return self._likelihood(self.copies).unflatten(0, (self.folds + 1, -1))
+
+    def drop(self) -> None:
+        """Keep the members that held-out answers need."""
+        comparisons = self.problem.comparisons
+        held_out = self._by_copy()[self.fold[comparisons.case], :, self.row].T
+        kept: Sequence[int] = sorted(smallest_subset(held_out, comparisons))
+        index = torch.arange(len(self.copies), device=self.share.device)
+        index = index.view(self.folds + 1, -1)[:, kept]
+        self.share = self.share[kept]
+        self._train(self.copies.subset(index.flatten()))
+
+    def expect(self) -> None:
+        """E-step: whom each member serves, told by copies that have not seen the case."""
+        likelihood = per_case(self._by_copy(), self.problem.comparisons)
+        served = expect(likelihood, self.share).responsibility[self.fold, :, self.case].T
+        self.share = served.mean(1)
+        everywhere = served[:, self.problem.comparisons.case]
+        self.weight = (self.use.unsqueeze(1) * everywhere).flatten(0, 1)
+
+    def descend(self, steps: int, *, rate: float) -> None:
+        """Gradient steps on batches that all copies share."""
+        training, comparisons = self.problem.training, self.problem.comparisons
+        self.optimizer.param_groups[0]["lr"] = training.learning_rate * rate
+        shape, device = (training.batch_size,), self.share.device
+        for _ in range(steps):
+            index = torch.randint(len(comparisons), shape, generator=self.generator, device=device)
+            losses = self.loss.pairs(comparisons.preferred[index], comparisons.other[index])
+            loss = (losses * self.weight[:, index]).mean(1).sum()
+            self.optimizer.zero_grad(set_to_none=True)
+            loss.backward()  # type: ignore[no-untyped-call]
+            self.optimizer.step()
+            self.copies.constrain_()
+
+    def result(self) -> Population:
+        """The copies that were trained on everything."""
+        count = len(self.copies)
+        return self.copies.subset(range(count - len(self.share), count))

@@ -11,49 +11,29 @@ import shutil
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation, GlobalRNGState
+
+from popl_rl.algorithms.problem import Method
 
 with warnings.catch_warnings():
     # TorchRL 0.14 deprecates a base class that it still derives from, and says so when imported.
     warnings.simplefilter("ignore", DeprecationWarning)
     from torchrl.trainers import OptimizationStepper, Trainer
 
-__all__ = ["Generational", "POPLTrainer"]
+__all__ = ["MethodTrainer"]
 
 
-class Generational(Protocol):
-    """What can be trained generation by generation, as :class:`~popl_rl.algorithms.popl.POPL` can.
-
-    Attributes:
-        generation: Generations done so far.
-    """
-
-    generation: int
-
-    def step(self) -> dict[str, float]:
-        """Run one generation and return scalars to log."""
-        ...
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything the next generation depends on."""
-        ...
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        ...
-
-
-class POPLTrainer(Trainer):
+class MethodTrainer(Trainer):
     """Runs a POPL to a number of generations and keeps its last two checkpoints.
 
     A checkpoint is written every ``checkpoint_interval`` generations and after the last one, after
     ``on_generation`` has returned: what that function wrote is never behind the checkpoint.
 
     Args:
-        popl: What to train; changed in place.
+        method: What to train; changed in place.
         generations: Generation to stop at, counted from the first of the run.
         checkpoint_dir: Folder of the checkpoints; created with the first one.
         checkpoint_interval: Generations between two checkpoints.
@@ -63,8 +43,8 @@ class POPLTrainer(Trainer):
         ValueError: If ``generations`` or ``checkpoint_interval`` is not positive.
 
     Example:
-        >>> trainer = POPLTrainer(  # doctest: +SKIP
-        ...     popl, generations=60, checkpoint_dir=run / "checkpoint", checkpoint_interval=5,
+        >>> trainer = MethodTrainer(  # doctest: +SKIP
+        ...     method, generations=60, checkpoint_dir=run / "checkpoint", checkpoint_interval=5,
         ...     on_generation=lambda generation, metrics: writer.write(generation, metrics),
         ... )
         >>> trainer.resume()  # doctest: +SKIP
@@ -74,7 +54,7 @@ class POPLTrainer(Trainer):
 
     def __init__(
         self,
-        popl: Generational,
+        method: Method,
         *,
         generations: int,
         checkpoint_dir: Path,
@@ -88,13 +68,13 @@ class POPLTrainer(Trainer):
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
         super().__init__(
-            collector=_Generations(popl, generations),
+            collector=_Generations(method, generations),
             total_frames=generations,
             frame_skip=1,
             optim_steps_per_batch=1,
             # Never called, as the stepper takes its place, but saved under this name.
-            loss_module=popl,
-            optimization_stepper=_Step(popl, on_generation),
+            loss_module=method,
+            optimization_stepper=_Step(method, on_generation),
             progress_bar=False,
             # An archive carries a CRC of every file: TorchRL's directory format would fill a
             # truncated tensor file with zeros and load it.
@@ -103,8 +83,8 @@ class POPLTrainer(Trainer):
             # The Trainer saves once more than this many frames have passed.
             save_trainer_interval=checkpoint_interval - 1,
         )
-        self.popl = popl
-        self.collected_frames = popl.generation
+        self.method = method
+        self.collected_frames = method.generation
 
     def resume(self) -> int:
         """Continue from the newest checkpoint that can be read.
@@ -132,14 +112,14 @@ class POPLTrainer(Trainer):
                     f"{'; '.join(problems)}",
                     stacklevel=2,
                 )
-            return self.popl.generation
+            return self.method.generation
         if found:
             raise ValueError(
                 f"no checkpoint in {directory} can be resumed ({'; '.join(problems)}); they are "
                 "damaged or of a run with another configuration: resume with that run's config, "
                 "or start again in another run_dir"
             )
-        return self.popl.generation
+        return self.method.generation
 
     def _restore(self, path: Path) -> None:
         if not Checkpoint.is_checkpoint(path):
@@ -151,14 +131,14 @@ class _Step(OptimizationStepper):
     """One generation in the place of an optimisation step."""
 
     def __init__(
-        self, popl: Generational, on_generation: Callable[[int, dict[str, float]], None]
+        self, method: Method, on_generation: Callable[[int, dict[str, float]], None]
     ) -> None:
-        self.popl = popl
+        self.method = method
         self.on_generation = on_generation
 
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
-        metrics = self.popl.step()
-        self.on_generation(self.popl.generation, metrics)
+        metrics = self.method.step()
+        self.on_generation(self.method.generation, metrics)
         return TensorDict(metrics)
 
 
@@ -167,12 +147,12 @@ class _Generations:
 
     init_random_frames = 0
 
-    def __init__(self, popl: Generational, generations: int) -> None:
-        self.popl = popl
+    def __init__(self, method: Method, generations: int) -> None:
+        self.method = method
         self.generations = generations
 
     def __iter__(self) -> Iterator[TensorDict]:
-        for _ in range(self.popl.generation, self.generations):
+        for _ in range(self.method.generation, self.generations):
             yield TensorDict(batch_size=[1])
 
     def shutdown(self) -> None:

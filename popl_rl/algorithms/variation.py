@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from popl_rl.algorithms.losses import CPLLoss, descend
+from popl_rl.algorithms.problem import Problem
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.population import Population
 from popl_rl.models.schedules import linear_decay
@@ -145,6 +146,21 @@ class GradientCPL:
         self.generator = generator
         self.optimizer = torch.optim.Adam(loss.population.members.parameters(), lr=learning_rate)
         self.schedule = linear_decay(self.optimizer, generations)
+
+    @classmethod
+    def of(
+        cls, problem: Problem, population: Population, *, generator: torch.Generator
+    ) -> "GradientCPL":
+        """The loop that descends a population's CPL losses by the recipe of a problem."""
+        return cls(
+            problem.loss(population),
+            problem.comparisons,
+            generations=problem.generations,
+            learning_rate=problem.training.learning_rate,
+            steps=problem.block,
+            batch_size=problem.training.batch_size,
+            generator=generator,
+        )
 
     def __call__(self, parents: Tensor, strength: Tensor) -> dict[str, float]:
         """See :class:`Variation`."""

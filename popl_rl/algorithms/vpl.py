@@ -19,6 +19,8 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from popl_rl.algorithms.losses import cpl_loss
+from popl_rl.algorithms.problem import Problem
+from popl_rl.config import VPLSettings
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.hypothesis_set import Catered
@@ -26,7 +28,8 @@ from popl_rl.models.policies import PolicySpec, build_network
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.population import Population
 from popl_rl.models.schedules import linear_decay
-from popl_rl.models.scoring import case_values, margins, rater_accuracy
+from popl_rl.models.scoring import case_values, rater_accuracy
+from popl_rl.selection.farthest_first import farthest_first
 
 __all__ = ["VPL", "AnswerEncoder", "EncodedPolicySet", "divergence", "spread_points"]
 
@@ -48,14 +51,13 @@ def spread_points(points: Tensor, count: int) -> Tensor:
     Returns:
         Different rows, ``[min(count, C)]``, int64.
     """
-    count = min(count, len(points))
-    chosen = [int((points - points.mean(0)).norm(dim=1).argmax())]
-    nearest = torch.full((len(points),), torch.inf, device=points.device)
-    for _ in range(count - 1):
-        nearest = torch.minimum(nearest, (points - points[chosen[-1]]).norm(dim=1))
-        nearest[chosen[-1]] = -torch.inf
-        chosen.append(int(nearest.argmax()))
-    return torch.tensor(chosen, device=points.device)
+    return farthest_first(
+        lambda some, others: -(points[some, None] - points[others]).norm(dim=-1),
+        len(points),
+        min(count, len(points)),
+        first=int((points - points.mean(0)).norm(dim=1).argmax()),
+        device=points.device,
+    )
 
 
 class AnswerEncoder(nn.Module):
@@ -197,65 +199,52 @@ class VPL:
     belief, plus the belief's divergence from N(0, 1).
 
     Args:
-        spec: Sizes of the policies.
-        bank: Segments that the comparisons refer to.
-        comparisons: M strict preferences and the case, that is the rater, of each.
-        latent: Length L of z.
-        kl: Weight of the divergence. 1 is the bound itself, under which three groups shared one
-            number of z on two doors and blurred.
-        generations: Generations to come; Adam's step size is held for half of them, then falls
-            linearly to zero.
-        steps: Gradient steps per generation.
-        batch_size: Answers per step; of ``answers`` each, that makes the number of raters.
-        answers: Answers of each rater, drawn with replacement.
-        learning_rate: Adam's step size.
-        alpha: Scale of the scores.
-        conservatism: Lambda of the CPL loss.
-        discount: Per-step discount of the scores.
+        problem: What is to be learnt. Its batch size, divided by the answers of a rater, makes the
+            number of raters in a batch.
+        vpl: Length L of z; weight of the divergence, where 1 is the bound itself, under which three
+            groups shared one number of z on two doors and blurred; answers of each rater, drawn
+            with replacement.
         generator: Source of all randomness.
 
     Attributes:
         generation: Generations done so far.
+        generations: Generations after which it is finished.
 
     Raises:
-        ValueError: If ``latent`` is below 1 or ``kl`` negative.
+        ValueError: If hypotheses are no policies, or style codes, every case is one preference,
+            ``latent`` is below 1 or ``kl`` negative.
     """
 
-    def __init__(
-        self,
-        spec: PolicySpec,
-        bank: SegmentBank,
-        comparisons: Comparisons,
-        *,
-        latent: int = 8,
-        kl: float = 0.1,
-        generations: int = 100,
-        steps: int = 15,
-        batch_size: int = 256,
-        answers: int = 16,
-        learning_rate: float = 2e-3,
-        alpha: float = 0.5,
-        conservatism: float = 0.9,
-        discount: float = 1.0,
-        generator: torch.Generator,
-    ) -> None:
-        if latent < 1:
-            raise ValueError(f"latent must be at least 1, got {latent}")
-        if not kl >= 0:
-            raise ValueError(f"kl must be at least 0, got {kl}")
-        self.spec, self.bank, self.comparisons = spec, bank, comparisons
-        self.kl, self.steps = kl, steps
-        self.raters, self.answers = max(1, batch_size // answers), answers
-        self.alpha, self.conservatism, self.discount = alpha, conservatism, discount
+    def __init__(self, problem: Problem, *, vpl: VPLSettings, generator: torch.Generator) -> None:
+        if not isinstance(problem.spec, PolicySpec):
+            raise ValueError(
+                "method vpl learns policies, not reward functions; choose another method, or set "
+                "method.learns=policy where there is something to do"
+            )
+        if problem.clone is not None or problem.evolve != "all":
+            raise ValueError(
+                "method.evolve must be all for method vpl, whose z takes the place of a style code"
+            )
+        if problem.comparisons.is_single:
+            raise ValueError(
+                "method vpl needs rater ids, because its encoder reads what one rater said; use "
+                "method.cases=rater with several answers of each"
+            )
+        if vpl.latent < 1:
+            raise ValueError(f"vpl.latent must be at least 1, got {vpl.latent}")
+        if not vpl.kl >= 0:
+            raise ValueError(f"vpl.kl must be at least 0, got {vpl.kl}")
+        self.problem, self.spec = problem, problem.spec
+        self.kl, self.answers = vpl.kl, vpl.answers
+        self.raters = max(1, problem.training.batch_size // vpl.answers)
         self.generator = generator
-        self.generation = 0
-        device = bank.row.device
-        self.encoder = AnswerEncoder(spec, latent, generator=generator).to(device)
-        conditioned = replace(spec, observation_dim=spec.observation_dim + latent)
-        self.network = build_network(conditioned, generator=generator).to(device)
+        self.generation, self.generations = 0, problem.generations
+        self.encoder = AnswerEncoder(self.spec, vpl.latent, generator=generator).to(problem.device)
+        conditioned = replace(self.spec, observation_dim=self.spec.observation_dim + vpl.latent)
+        self.network = build_network(conditioned, generator=generator).to(problem.device)
         parameters = [*self.encoder.parameters(), *self.network.parameters()]
-        self.optimizer = torch.optim.Adam(parameters, lr=learning_rate)
-        self.schedule = linear_decay(self.optimizer, generations)
+        self.optimizer = torch.optim.Adam(parameters, lr=problem.training.learning_rate)
+        self.schedule = linear_decay(self.optimizer, problem.generations)
 
     def step(self) -> dict[str, float]:
         """Run one generation: judge the policies, then train.
@@ -265,12 +254,9 @@ class VPL:
             accuracy) and ``mean_accuracy``, both as the generation found them, ``loss_cpl`` and
             ``divergence``.
         """
-        margin = margins(
-            self.population, self.bank, self.comparisons, alpha=self.alpha, discount=self.discount
-        )
-        passes = margin > 0
+        passes = self.problem.margins(self.population) > 0
         loss, apart = torch.zeros(2)
-        for _ in range(self.steps):
+        for _ in range(self.problem.block):
             loss, apart = self._losses()
             bound = loss + self.kl * apart / self.answers
             self.optimizer.zero_grad(set_to_none=True)
@@ -279,7 +265,7 @@ class VPL:
         self.schedule.step()
         self.generation += 1
         return {
-            "worst_rater_accuracy": rater_accuracy(case_values(passes, self.comparisons)),
+            "worst_rater_accuracy": rater_accuracy(case_values(passes, self.problem.comparisons)),
             "mean_accuracy": float(passes.float().mean()),
             "loss_cpl": float(loss.detach()),
             "divergence": float(apart.detach()),
@@ -287,35 +273,40 @@ class VPL:
 
     def _losses(self) -> tuple[Tensor, Tensor]:
         """CPL loss of an answer, and divergence of a rater's belief, both of a fresh batch."""
-        source, device = self.generator, self.bank.row.device
+        source, said = self.generator, self.problem.comparisons
         rater = torch.randint(
-            self.comparisons.num_cases, (self.raters,), generator=source, device=device
+            said.num_cases, (self.raters,), generator=source, device=self.problem.device
         )
-        mine = (self.comparisons.case == rater.unsqueeze(1)).float()
+        mine = (said.case == rater.unsqueeze(1)).float()
         index = torch.multinomial(mine, self.answers, replacement=True, generator=source)
-        preferred, other = self.comparisons.preferred[index], self.comparisons.other[index]
-        mean, log_std = self.encoder(self.bank, preferred, other)
-        noise = torch.randn(mean.shape, generator=source, device=device)
+        preferred, other = said.preferred[index], said.other[index]
+        mean, log_std = self.encoder(self.problem.bank, preferred, other)
+        noise = torch.randn(mean.shape, generator=source, device=mean.device)
         z = mean + log_std.exp() * noise
         better, worse = self.scores(preferred, z), self.scores(other, z)
-        loss = cpl_loss(better, worse, conservatism=self.conservatism).mean()
+        recipe = self.problem.training
+        lam = self.problem.conservatism
+        loss = cpl_loss(better, worse, conservatism=lam, slip=recipe.slip).mean()
         return loss, divergence(mean, log_std).mean()
 
     def scores(self, segment: Tensor, z: Tensor) -> Tensor:
         """Scores of segments ``[B, K]`` by the policies for z ``[B, L]``, ``[B, K]``."""
-        observation = self.bank.observation[self.bank.row[segment]]
+        bank, recipe = self.problem.bank, self.problem.training
+        observation = bank.observation[bank.row[segment]]
         wants = z[:, None, None].expand(*observation.shape[:-1], -1)
         output = self.network(torch.cat([observation, wants], -1))
-        step = self.spec.step_scores(output, self.bank.action[segment])
+        step = self.spec.step_scores(output, bank.action[segment])
         time = torch.arange(step.shape[-1], device=step.device)
-        scores: Tensor = step @ (self.alpha * self.discount ** time.float())
+        scores: Tensor = step @ (recipe.alpha * recipe.discount ** time.float())
         return scores
 
     @torch.no_grad()
     def beliefs(self) -> Tensor:
         """The encoder's mean for every rater, from all of the rater's answers, ``[C, L]``."""
-        said = self.comparisons
-        pair = [self.encoder.segments(self.bank, side) for side in (said.preferred, said.other)]
+        said = self.problem.comparisons
+        pair = [
+            self.encoder.segments(self.problem.bank, side) for side in (said.preferred, said.other)
+        ]
         embedded = self.encoder.answer(torch.cat(pair, -1)).relu()
         total = embedded.new_zeros(said.num_cases, embedded.shape[1])
         total.index_add_(0, said.case, embedded)
@@ -339,12 +330,16 @@ class VPL:
         """The policies of the set as it is now."""
         return self.policies_for(self._z())
 
-    def policies(self) -> EncodedPolicySet:
+    def result(self) -> EncodedPolicySet:
         """A set of policies for what different raters want."""
         z = self._z()
         encoder = copy.deepcopy(self.encoder).requires_grad_(False)
         return EncodedPolicySet(
-            self.policies_for(z), encoder=encoder, z=z, alpha=self.alpha, discount=self.discount
+            self.policies_for(z),
+            encoder=encoder,
+            z=z,
+            alpha=self.problem.training.alpha,
+            discount=self.problem.training.discount,
         )
 
     def _z(self) -> Tensor:

@@ -1,1 +1,7 @@
-"""data."""
+"""Behaviour to be compared: environments, episodes, segments, and the comparisons of segments.
+
+* ``environments``: environments built from settings; ``tables``: their transitions, solved exactly.
+* ``behaviours``: who acts while data are collected; ``rollouts``: whole episodes in lockstep.
+* ``segments``: episodes cut into segments; ``store``: segments that several runs share.
+* ``bank``: segments as scoring reads them; ``comparisons``: preferences as learning reads them.
+"""

@@ -32,6 +32,11 @@ class Comparisons:
     def __len__(self) -> int:
         return len(self.preferred)
 
+    @property
+    def is_single(self) -> bool:
+        """Whether every case is a single preference, as where nobody kept rater ids."""
+        return self.num_cases == len(self)
+
     @classmethod
     def from_preferences(cls, preferences: TensorDictBase, *, cases: str) -> "Comparisons":
         """Keep the strict answers.

@@ -1,4 +1,9 @@
-"""Environments as a run uses them, and what each offers beyond Gymnasium's interface."""
+"""Environments as a run uses them, and what each offers beyond Gymnasium's interface.
+
+Where actions are ``Discrete(n, start)``, everything about an environment (its steps, its table, its
+behaviours, segments) has them from ``start`` on; :func:`indexed` and :func:`counting_from_zero` are
+the border to learners, who count them from 0.
+"""
 
 import fnmatch
 from collections.abc import Callable, Mapping, Sequence
@@ -13,11 +18,25 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from popl_rl.config import EnvConfig
-from popl_rl.data.behaviours import Behaviour, random_behaviour, table_behaviour
+from popl_rl.data.behaviours import (
+    Behaviour,
+    first_action,
+    random_behaviour,
+    table_behaviour,
+)
 from popl_rl.data.tables import Table
+from popl_rl.keys import ACTION
 from popl_rl.registry import resolve
 
-__all__ = ["Collect", "World", "behaviour_shares", "build_world", "is_stateless"]
+__all__ = [
+    "Collect",
+    "World",
+    "behaviour_shares",
+    "build_world",
+    "counting_from_zero",
+    "indexed",
+    "is_stateless",
+]
 
 MakeEnv = Callable[[], gymnasium.Env[Any, Any]]
 
@@ -106,9 +125,10 @@ def build_world(config: EnvConfig) -> World:
     env = make()
     inner = env.unwrapped
     table = inner.transition_table() if hasattr(inner, "transition_table") else None
+    first = first_action(env.action_space)
     given = inner.behaviours() if hasattr(inner, "behaviours") else {}
     behaviours = {
-        name: table_behaviour(what) if isinstance(what, Tensor) else what
+        name: table_behaviour(what, first=first) if isinstance(what, Tensor) else what
         for name, what in given.items()
     } or {"random": random_behaviour(env.action_space)}
     shares = behaviour_shares(list(behaviours), config.mixture)
@@ -146,3 +166,30 @@ def behaviour_shares(names: Sequence[str], mixture: Mapping[str, float] | None) 
 def is_stateless(env: gymnasium.Env[Any, Any]) -> bool:
     """Whether an environment has a single action, so that one can only judge what is seen."""
     return isinstance(env.action_space, gymnasium.spaces.Discrete) and env.action_space.n == 1
+
+
+def indexed(segments: TensorDictBase, action_space: gymnasium.Space[Any]) -> TensorDictBase:
+    """Segments as a learner reads them: discrete actions counted from 0.
+
+    Args:
+        segments: TensorDict ``[N, T]`` with actions as the environment takes them.
+        action_space: The environment's actions.
+
+    Returns:
+        The segments themselves where nothing changes; a shallow copy with other actions elsewhere.
+    """
+    first = first_action(action_space)
+    if first == 0:
+        return segments
+    copy: TensorDictBase = segments.copy()
+    return copy.set(ACTION, segments[ACTION] - first)
+
+
+def counting_from_zero(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+    """The environment for a learner: discrete actions counted from 0."""
+    space = env.action_space
+    first = first_action(space)
+    if first == 0:
+        return env
+    counted = gymnasium.spaces.Discrete(int(cast("gymnasium.spaces.Discrete", space).n))
+    return gymnasium.wrappers.TransformAction(env, lambda action: action + first, counted)

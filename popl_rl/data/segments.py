@@ -83,18 +83,8 @@ def collect_segments(
         "max_steps": max_steps,
         "num_envs": num_envs,
     }
-    for name, value in counts.items():
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
-    if not behaviours:
-        raise ValueError("behaviours must hold at least one behaviour, got none")
-    given = dict.fromkeys(behaviours, 1 / len(behaviours)) if shares is None else dict(shares)
-    proper = given.keys() <= behaviours.keys() and all(share >= 0 for share in given.values())
-    if not proper or not abs(sum(given.values()) - 1) < 1e-6:
-        raise ValueError(
-            f"shares must be non-negative, sum to 1 and name behaviours out of {list(behaviours)}, "
-            f"got {given}"
-        )
+    _check_counts(counts)
+    given = _checked_shares(behaviours, shares)
     envs = [make_env() for _ in range(num_envs)]
     collected: list[TensorDict] = []
     total, reached = 0, 0.0
@@ -128,6 +118,28 @@ def collect_segments(
             env.close()
     everything: TensorDict = torch.cat(collected)  # type: ignore[call-overload]
     return everything[torch.randperm(total, generator=generator)]
+
+
+def _check_counts(counts: Mapping[str, int]) -> None:
+    for name, value in counts.items():
+        if value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
+
+
+def _checked_shares(
+    behaviours: Mapping[str, Behaviour], shares: Mapping[str, float] | None
+) -> dict[str, float]:
+    """Share of the segments that each behaviour gives; none if it is not named."""
+    if not behaviours:
+        raise ValueError("behaviours must hold at least one behaviour, got none")
+    given = dict.fromkeys(behaviours, 1 / len(behaviours)) if shares is None else dict(shares)
+    proper = given.keys() <= behaviours.keys() and all(share >= 0 for share in given.values())
+    if not proper or not abs(sum(given.values()) - 1) < 1e-6:
+        raise ValueError(
+            f"shares must be non-negative, sum to 1 and name behaviours out of {list(behaviours)}, "
+            f"got {given}"
+        )
+    return given
 
 
 def _act(behaviour: Behaviour, generator: torch.Generator, step: TensorDictBase) -> Tensor:

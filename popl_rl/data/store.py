@@ -3,15 +3,13 @@
 import hashlib
 import json
 import re
-import shutil
-import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from tensordict import TensorDictBase
 
-from popl_rl.storage import locked, save_tensordict
+from popl_rl.storage import locked, save_tensordict, written_beside
 
 __all__ = ["store_path", "stored"]
 
@@ -51,14 +49,10 @@ def stored(path: Path, about: Mapping[str, Any], make: Callable[[], TensorDictBa
             _check(path, about)
             return segments
         data = make()
-        beside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
-        try:
-            save_tensordict(data, beside / "whole" / "segments")
+        with written_beside(path) as beside:
+            save_tensordict(data, beside / "segments")
             text = json.dumps(about, indent=2, sort_keys=True)
-            (beside / "whole" / "about.json").write_text(text, encoding="utf-8")
-            (beside / "whole").rename(path)
-        finally:
-            shutil.rmtree(beside, ignore_errors=True)
+            (beside / "about.json").write_text(text, encoding="utf-8")
     return segments
 
 

@@ -98,7 +98,7 @@ def solve(
 
     Args:
         table: The transitions.
-        reward: ``[S, A]`` float, what each step is segment_utility.
+        reward: ``[S, A]`` float, what each step is worth.
         discount: Worth of the next step relative to this one, in (0, 1].
         temperature: Weight of the entropy; 0 takes the best action.
 
@@ -143,7 +143,7 @@ def policy_return(table: Table, probabilities: Tensor, reward: Tensor, *, horizo
     Args:
         table: The transitions.
         probabilities: ``[S, A]``, the policy: each row sums to one.
-        reward: ``[S, A]`` float, what each step is segment_utility.
+        reward: ``[S, A]`` float, what each step is worth.
         horizon: Number of steps after which an episode is cut off, at least 1.
 
     Raises:

@@ -11,7 +11,7 @@ from torch import Tensor
 from popl_rl.config import EnvConfig, EvaluationConfig
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.behaviours import random_behaviour
-from popl_rl.data.environments import World
+from popl_rl.data.environments import World, counting_from_zero
 from popl_rl.data.rollouts import MASK
 from popl_rl.data.tables import Table, solve
 from popl_rl.evaluation.measures import roll_out
@@ -130,11 +130,12 @@ class Optimising(Rolling):
         own = rewards.population.members.data[member].values(True, True)
         key = b"".join(value.cpu().numpy().tobytes() for value in own)
         if key not in self._trained:
+            # PPO's policies choose actions as reward functions judge them: counted from 0.
             spec = PolicySpec.from_env(self.world.env, hidden=(64, 64))
             best = rewards.subset([member]).reward(self.bank.observation).max()
             reward = reward_of(rewards, member)
             self._trained[key] = train_ppo(
-                self.world.make,
+                lambda: counting_from_zero(self.world.make()),
                 lambda observation, action: reward(observation, action) - best,
                 spec,
                 frames=self.config.ppo_frames,

@@ -41,6 +41,7 @@ from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.scoring import case_values, segment_scores
 from popl_rl.randomness import stream
 from popl_rl.raters.groups import RaterGroup
+from popl_rl.raters.pairs import PairPool
 
 __all__ = ["Evaluator"]
 
@@ -59,7 +60,7 @@ class Evaluator:
         groups: G groups.
         bank: Segments to judge on.
         segment_utility: Worth of each segment to each group, ``[G, N]``.
-        start: Which segments may be compared, ``[N]``; all if None.
+        pool: Pairs to evaluate on; all pairs of the N segments if None.
         clone: A clone of the data's typical behaviour, for comparison; None for none.
         shares: Chance that a rater is of each group; equal if None.
         seed: Seed of the run.
@@ -74,19 +75,19 @@ class Evaluator:
         bank: SegmentBank,
         segment_utility: Tensor,
         *,
-        start: Tensor | None = None,
+        pool: PairPool | None = None,
         clone: HypothesisSet | None = None,
         shares: Sequence[float] | None = None,
         seed: int,
     ) -> None:
         self.acting, self.env, self.config = acting, env, config
         self.groups, self.bank, self.segment_utility = groups, bank, segment_utility
-        self.start, self.clone = start, clone
+        self.pool, self.clone = pool, clone
         self.shares, self.seed = shares, seed
         generator = stream(seed, "held-out pairs")
         self.pairs = {
             index: held_out_pairs(
-                segment_utility, index, count=config.pairs, start=start, generator=generator
+                segment_utility, index, count=config.pairs, pool=pool, generator=generator
             )
             for index in range(len(groups))
         }
@@ -127,7 +128,7 @@ class Evaluator:
                         index,
                         self.segment_utility,
                         answers=answers,
-                        start=self.start,
+                        pool=self.pool,
                         generator=generator,
                     )
                     for _ in range(self.config.new_raters)
@@ -170,7 +171,7 @@ class Evaluator:
                 raters=_PANEL * self.config.new_raters,
                 answers=_PANEL_ANSWERS,
                 shares=self.shares,
-                start=self.start,
+                pool=self.pool,
                 generator=generator,
             )
             for _ in range(2)

@@ -17,6 +17,7 @@ from popl_rl.keys import RATER
 from popl_rl.models.preference_likelihood import log_likelihood, per_case
 from popl_rl.models.scoring import case_values
 from popl_rl.raters.groups import RaterGroup
+from popl_rl.raters.pairs import PairPool
 from popl_rl.raters.people import Raters
 
 __all__ = ["Gain", "draw_held_out_raters", "favourites", "gain"]
@@ -43,7 +44,7 @@ def draw_held_out_raters(
     raters: int,
     answers: int,
     shares: Sequence[float] | None,
-    start: Tensor | None = None,
+    pool: PairPool | None = None,
     generator: torch.Generator,
 ) -> TensorDict:
     """Ask new raters, drawn in the shares of the groups.
@@ -54,7 +55,7 @@ def draw_held_out_raters(
         raters: Number of raters R.
         answers: Strict answers K of each.
         shares: Chance of each group; equal if None.
-        start: Which segments may be compared, ``[N]``; all if None.
+        pool: What pairs are drawn from; all pairs of the N segments if None.
         generator: Source of raters, pairs and answers.
 
     Returns:
@@ -66,7 +67,7 @@ def draw_held_out_raters(
     people = Raters.draw(groups, num_raters=raters, shares=shares, generator=generator)
     said = [
         new_rater_answers(
-            groups, group, segment_utility, answers=answers, start=start, generator=generator
+            groups, group, segment_utility, answers=answers, pool=pool, generator=generator
         )
         for group in people.group_of.tolist()
     ]

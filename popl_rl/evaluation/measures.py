@@ -8,11 +8,12 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from popl_rl.data.behaviours import first_action
 from popl_rl.data.rollouts import MASK, lockstep
 from popl_rl.keys import ANSWER, INFO, OBSERVATION, PAIR, Answer
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.raters.groups import RaterGroup
-from popl_rl.raters.pairs import draw_pairs
+from popl_rl.raters.pairs import PairPool
 from popl_rl.raters.people import Raters
 
 __all__ = [
@@ -52,7 +53,8 @@ def roll_out(
         random_action: A behaviour to roll without policies.
 
     Returns:
-        TensorDict ``[P, E, H]`` as from :func:`~popl_rl.data.rollouts.lockstep`.
+        TensorDict ``[P, E, H]`` as from :func:`~popl_rl.data.rollouts.lockstep`; discrete actions
+        are those of the environment, which need not begin with 0.
 
     Raises:
         ValueError: If ``episodes`` or ``max_steps`` is not positive, or there is nothing to roll.
@@ -72,15 +74,16 @@ def roll_out(
         if isinstance(policies, Tensor):
             state = step[INFO, "next_state"].long().view(count, episodes)
             rows = policies[torch.arange(count).unsqueeze(1), state].flatten(0, 1)
-            return torch.multinomial(rows, 1, generator=generator).squeeze(-1)
+            return first + torch.multinomial(rows, 1, generator=generator).squeeze(-1)
         if policies is not None:
             observation = step[OBSERVATION].view(count, episodes, -1).to(device)
             action = policies.act(observation, greedy=greedy, generator=generator)
-            return action.flatten(0, 1).cpu()
+            return first + action.flatten(0, 1).cpu()
         assert random_action is not None
         return random_action(step, generator)
 
     envs = [make_env() for _ in range(count * episodes)]
+    first = first_action(envs[0].action_space)
     try:
         flat = lockstep(envs, act, seeds=starts * count, max_steps=max_steps)
     finally:
@@ -93,16 +96,28 @@ def group_returns(episodes: TensorDictBase, groups: Sequence[RaterGroup]) -> Ten
     """Mean undiscounted utility of an episode to each group.
 
     Args:
-        episodes: ``[P, E, H]``.
+        episodes: ``[P, E, H]``. What stands after an episode's end is not shown to the groups,
+            whose utilities may be undefined there.
         groups: G groups.
 
     Returns:
         ``[P, G]``.
     """
     flat = episodes.flatten(0, 1)
-    mask = flat[MASK].float()
-    segment_utility = [(group.step_utility(flat) * mask).sum(1) for group in groups]
-    return torch.stack(segment_utility, -1).view(*episodes.shape[:2], -1).mean(1)
+    mask = flat[MASK]
+    shown = _with_last_step_repeated(flat)
+    returns = [torch.where(mask, group.step_utility(shown), 0).sum(1) for group in groups]
+    return torch.stack(returns, -1).view(*episodes.shape[:2], -1).mean(1)
+
+
+def _with_last_step_repeated(episodes: TensorDictBase) -> TensorDictBase:
+    """Episodes ``[B, H]`` whose last real step stands in the place of what follows its end too."""
+    mask = episodes[MASK]
+    if bool(mask.all()):
+        return episodes
+    last = mask.sum(1, keepdim=True) - 1
+    step = torch.arange(mask.shape[1]).minimum(last)
+    return episodes[torch.arange(len(mask)).unsqueeze(1), step]
 
 
 def info_rates(episodes: TensorDictBase, key: str) -> dict[int, Tensor]:
@@ -157,7 +172,7 @@ def held_out_pairs(
     group: int,
     *,
     count: int,
-    start: Tensor | None = None,
+    pool: PairPool | None = None,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
     """Fresh pairs on which a group has a strict opinion, and no rater's noise.
@@ -166,13 +181,14 @@ def held_out_pairs(
         segment_utility: Worth of each stored segment to each group, ``[G, N]``.
         group: Which group.
         count: Pairs to draw; those of (nearly) equal worth are dropped.
-        start: Which segments may be compared, ``[N]``; all if None.
+        pool: What pairs are drawn from; all pairs of the N segments if None.
         generator: Source of the pairs.
 
     Returns:
         Preferred and other segments, each ``[count or fewer]``.
     """
-    pair = draw_pairs(segment_utility.shape[1], count, start=start, generator=generator)
+    pool = PairPool(segment_utility.shape[1]) if pool is None else pool
+    pair = pool.draw(count, generator=generator)
     first, second = segment_utility[group][pair].unbind(-1)
     strict = (first - second).abs() > 1e-6
     swap = (first < second)[strict]
@@ -201,7 +217,7 @@ def new_rater_answers(
     segment_utility: Tensor,
     *,
     answers: int,
-    start: Tensor | None = None,
+    pool: PairPool | None = None,
     generator: torch.Generator,
 ) -> TensorDict:
     """Strict answers of a new rater of one group, noisy as that group's raters are.
@@ -211,7 +227,7 @@ def new_rater_answers(
         group: The new rater's group.
         segment_utility: ``[G, N]``.
         answers: Number of strict answers; ties and skips are asked again.
-        start: Which segments may be compared, ``[N]``; all if None.
+        pool: What pairs are drawn from; all pairs of the N segments if None.
         generator: Source of the pairs and of the rater's randomness.
 
     Returns:
@@ -220,10 +236,11 @@ def new_rater_answers(
     Raises:
         ValueError: If the rater keeps answering ties and skips.
     """
+    pool = PairPool(segment_utility.shape[1]) if pool is None else pool
     person = Raters(tuple(groups), torch.tensor([group]))
     pairs, replies, found = [], [], 0
     for _ in range(100):
-        pair = draw_pairs(segment_utility.shape[1], answers, start=start, generator=generator)
+        pair = pool.draw(answers, generator=generator)
         asked = torch.zeros(answers, dtype=torch.long)
         reply = person.answer(pair, asked, segment_utility, generator=generator)
         strict = reply <= Answer.SECOND

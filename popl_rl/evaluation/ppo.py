@@ -5,12 +5,11 @@ a constant per step, so where an episode can end, whether ending it pays is not 
 the offset of a reward learnt from returns before it is maximised there.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
 import gymnasium
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
@@ -19,7 +18,12 @@ from torchrl.modules import RunningValueNorm, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from popl_rl.data.rollouts import MASK, lockstep
+from popl_rl.evaluation.ppo_episodes import (
+    Ending,
+    clip_actions,
+    roll_episodes,
+    running_returns,
+)
 from popl_rl.keys import ACTION, OBSERVATION, REWARD
 from popl_rl.models.policies import PolicySpec, build_actor, build_network
 from popl_rl.models.population import Population
@@ -139,24 +143,16 @@ def train_ppo(
         raise ValueError(f"entropy must be 0 or positive, got {entropy}")
 
     network = build_network(spec, generator=generator)
-    actor = build_actor(spec, network)
-    value = PolicySpec(spec.observation_dim, 1, discrete=False, hidden=spec.hidden)
-    critic = ValueOperator(build_network(value, generator=generator), in_keys=[OBSERVATION])
-    advantage = GAE(gamma=discount, lmbda=gae_lambda, value_network=critic, deactivate_vmap=True)
-    loss = ClipPPOLoss(
-        actor,
-        critic,
+    learner = _Learner(
+        spec,
+        network,
+        discount=discount,
+        gae_lambda=gae_lambda,
         clip_epsilon=clip_epsilon,
-        entropy_coeff=entropy,
-        critic_coeff=0.5,
-        loss_critic_type="l2",
-        log_explained_variance=False,
-        functional=False,
+        learning_rate=learning_rate,
+        generator=generator,
     )
-    loss.set_keys(sample_log_prob=_LOG_PROB)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=learning_rate, eps=1e-5, fused=True)
-    returns = RunningValueNorm(shape=1, epsilon=1e-16)
-    envs = [_Ending(make_env()) for _ in range(num_envs)]
+    envs = [Ending(make_env()) for _ in range(num_envs)]
     try:
         _check_spec(spec, envs[0])
         act = partial(_act, spec, network, generator=generator)
@@ -164,24 +160,14 @@ def train_ppo(
         while done < frames:
             rolled: list[TensorDict] = []
             while sum(map(len, rolled)) < frames_per_batch:
-                rolled.append(_roll(envs, act, max_steps=max_steps, generator=generator))
+                rolled.append(roll_episodes(envs, act, max_steps=max_steps, generator=generator))
             batch: TensorDict = TensorDict.cat(rolled)
-            action = _clip(envs[0].action_space, batch[ACTION])
+            action = clip_actions(envs[0].action_space, batch[ACTION])
             gain = _rewards(reward, batch[OBSERVATION], action)
             over = batch["next", "done"].squeeze(-1)
-            returns.update(_running_returns(gain, over, discount))
-            batch["next", REWARD] = gain.unsqueeze(-1) / returns.scale()
-            with torch.no_grad():
-                advantage(batch)
-                batch[_LOG_PROB] = actor.get_dist(batch).log_prob(batch[ACTION])
-            # Here and not by the loss, whose last minibatch may be a single step.
-            centred = batch[_ADVANTAGE] - batch[_ADVANTAGE].mean()
-            batch[_ADVANTAGE] = centred / centred.square().mean().sqrt().clamp(min=1e-8)
-            left = 1 - done / frames
-            loss.entropy_coeff.fill_(entropy * left)
-            for group in optimizer.param_groups:
-                group["lr"] = learning_rate * left
-            _update(loss, optimizer, batch, epochs, minibatch, generator)
+            learner.value(batch, gain)
+            learner.anneal(1 - done / frames, entropy)
+            learner.update(batch, epochs, minibatch)
             done += len(batch)
             if progress is not None:
                 progress(done, float(gain.sum() / over.sum()))
@@ -191,34 +177,83 @@ def train_ppo(
     return Population([network], spec)
 
 
-class _Ending(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Keeps how an episode ended, which lockstep does not record, and keeps actions in bounds."""
+class _Learner:
+    """Actor, critic and optimiser, which learn from one batch of steps after the other."""
 
-    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
-        super().__init__(env)
-        self.last: Any = None
-        self.terminated = False
+    def __init__(
+        self,
+        spec: PolicySpec,
+        network: nn.Sequential,
+        *,
+        discount: float,
+        gae_lambda: float,
+        clip_epsilon: float,
+        learning_rate: float,
+        generator: torch.Generator,
+    ) -> None:
+        self.discount, self.learning_rate = discount, learning_rate
+        self.generator = generator
+        self.actor = build_actor(spec, network)
+        value = PolicySpec(spec.observation_dim, 1, discrete=False, hidden=spec.hidden)
+        critic = ValueOperator(build_network(value, generator=generator), in_keys=[OBSERVATION])
+        self.advantage = GAE(
+            gamma=discount, lmbda=gae_lambda, value_network=critic, deactivate_vmap=True
+        )
+        self.loss = ClipPPOLoss(
+            self.actor,
+            critic,
+            clip_epsilon=clip_epsilon,
+            entropy_coeff=0.0,  # set for each batch
+            critic_coeff=0.5,
+            loss_critic_type="l2",
+            log_explained_variance=False,
+            functional=False,
+        )
+        self.loss.set_keys(sample_log_prob=_LOG_PROB)
+        self.optimizer = torch.optim.Adam(
+            self.loss.parameters(), lr=learning_rate, eps=1e-5, fused=True
+        )
+        self.returns = RunningValueNorm(shape=1, epsilon=1e-16)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        observation, _ = self.env.reset(seed=seed, options=options)
-        return observation, {}
+    def value(self, batch: TensorDict, gain: Tensor) -> None:
+        """Write scaled rewards, log-probabilities and advantages into a batch ``[S]``, in place.
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        space = self.env.action_space
-        if isinstance(space, gymnasium.spaces.Box):
-            action = np.clip(action, space.low, space.high)
-        self.last, _, self.terminated, truncated, _ = self.env.step(action)
-        # A reward that is not used, and no info, which would be copied into every step.
-        return self.last, 0.0, self.terminated, truncated, {}
+        Args:
+            batch: Steps of whole episodes, one episode after the other.
+            gain: Reward of each step, ``[S]``.
+        """
+        over = batch["next", "done"].squeeze(-1)
+        self.returns.update(running_returns(gain, over, self.discount))
+        batch["next", REWARD] = gain.unsqueeze(-1) / self.returns.scale()
+        with torch.no_grad():
+            self.advantage(batch)
+            batch[_LOG_PROB] = self.actor.get_dist(batch).log_prob(batch[ACTION])
+        # Here and not by the loss, whose last minibatch may be a single step.
+        centred = batch[_ADVANTAGE] - batch[_ADVANTAGE].mean()
+        batch[_ADVANTAGE] = centred / centred.square().mean().sqrt().clamp(min=1e-8)
 
+    def anneal(self, left: float, entropy: float) -> None:
+        """Scale step size and entropy bonus by the share of the frames that is left."""
+        self.loss.entropy_coeff.fill_(entropy * left)
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.learning_rate * left
 
-def _clip(space: gymnasium.Space[Any], action: Tensor) -> Tensor:
-    """Actions as an :class:`_Ending` carries them out; a Gaussian policy knows no bounds."""
-    if not isinstance(space, gymnasium.spaces.Box):
-        return action
-    return action.clamp(torch.from_numpy(space.low), torch.from_numpy(space.high)).to(action.dtype)
+    def update(self, batch: TensorDict, epochs: int, minibatch: int) -> None:
+        """Take gradient steps on minibatches of a batch ``[S]``, in passes over all of it."""
+        buffer = ReplayBuffer(
+            storage=TensorStorage(batch.exclude("next")),
+            sampler=SamplerWithoutReplacement(),
+            batch_size=minibatch,
+            generator=self.generator,
+        )
+        for _ in range(epochs):
+            for some in buffer:
+                terms = self.loss(some)
+                total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
+                self.optimizer.zero_grad()
+                total.backward()
+                nn.utils.clip_grad_norm_(self.loss.parameters(), 0.5)
+                self.optimizer.step()
 
 
 def _check_numbers(
@@ -254,33 +289,6 @@ def _act(
     return output + spec.action_std * torch.randn(output.shape, generator=generator)
 
 
-def _roll(
-    envs: Sequence[_Ending],
-    act: Callable[[TensorDictBase], Tensor],
-    *,
-    max_steps: int,
-    generator: torch.Generator,
-) -> TensorDict:
-    """Steps ``[S]`` of one episode in each environment, one episode after the other."""
-    seeds = torch.randint(2**31, (len(envs),), generator=generator).tolist()
-    episodes = lockstep(envs, act, seeds=seeds, max_steps=max_steps)
-    mask = episodes[MASK]
-    rows, last = torch.arange(len(envs)), mask.sum(1) - 1
-    # What follows a step is seen at the next one, but for the last, whose outcome is elsewhere.
-    following = episodes[OBSERVATION].roll(-1, 1)
-    following[rows, last] = torch.stack(
-        [torch.as_tensor(env.last, dtype=following.dtype) for env in envs]
-    )
-    done, terminated = torch.zeros(2, *mask.shape, 1, dtype=torch.bool)
-    done[rows, last] = True
-    terminated[rows, last, 0] = torch.tensor([env.terminated for env in envs])
-    episodes = episodes.select(OBSERVATION, ACTION)
-    episodes["next"] = TensorDict(
-        {OBSERVATION: following, "done": done, "terminated": terminated}, episodes.batch_size
-    )
-    return episodes[mask]
-
-
 @torch.no_grad()
 def _rewards(reward: RewardFunction, observation: Tensor, action: Tensor) -> Tensor:
     gain = reward(observation, action)
@@ -300,37 +308,3 @@ def _rewards(reward: RewardFunction, observation: Tensor, action: Tensor) -> Ten
             f"ones in {len(gain)} steps; look at the network it comes from"
         )
     return gain.float()
-
-
-def _running_returns(gain: Tensor, done: Tensor, discount: float) -> Tensor:
-    """Discounted sum of an episode's rewards up to each step, ``[S, 1]``."""
-    sums, total = [], 0.0
-    for value, ends in zip(gain.tolist(), done.tolist(), strict=True):
-        total = discount * total + value
-        sums.append(total)
-        total = 0.0 if ends else total
-    return torch.tensor(sums).unsqueeze(-1)
-
-
-def _update(
-    loss: ClipPPOLoss,
-    optimizer: torch.optim.Optimizer,
-    batch: TensorDict,
-    epochs: int,
-    minibatch: int,
-    generator: torch.Generator,
-) -> None:
-    buffer = ReplayBuffer(
-        storage=TensorStorage(batch.exclude("next")),
-        sampler=SamplerWithoutReplacement(),
-        batch_size=minibatch,
-        generator=generator,
-    )
-    for _ in range(epochs):
-        for some in buffer:
-            terms = loss(some)
-            total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
-            optimizer.zero_grad()
-            total.backward()
-            nn.utils.clip_grad_norm_(loss.parameters(), 0.5)
-            optimizer.step()

@@ -12,17 +12,14 @@ from typing import Any
 
 import pandas as pd
 
-from popl_rl.config import ALGORITHMS
 from popl_rl.evaluation.suite import Suite
+from popl_rl.experiments.run_folder import load_config
 from popl_rl.storage import write_atomic, write_json
 
 __all__ = ["COLUMNS", "Cell", "claim", "collect", "is_finished", "plan"]
 
 COLUMNS = ["suite", "scenario", "seed", "method", "group", "measure", "value"]
 """Columns of a benchmark's ``results.csv``."""
-
-# What popl-train calls the method that it was asked for.
-_LEARNT = rf"(?:{'|'.join(sorted(set(ALGORITHMS.values())))})(?:_lexicase)?"
 
 
 @dataclass(frozen=True)
@@ -199,7 +196,8 @@ def collect(suite: Suite, cells: Sequence[Cell], run_dir: Path) -> pd.DataFrame:
             continue
         folder = cell.folder(run_dir)
         rows = pd.read_csv(folder / "results.csv")
-        own = rows["method"].str.fullmatch(_LEARNT)
+        label = load_config(folder).method.name
+        own = rows["method"].isin([label, f"{label}_lexicase"])
         if not cell.leads:
             rows, own = rows[own], own[own]
         suffix = rows["method"].str.endswith("_lexicase").map({True: "_lexicase", False: ""})

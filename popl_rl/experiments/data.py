@@ -20,6 +20,7 @@ from popl_rl.keys import ACTION, GROUP, INFO, OBSERVATION
 from popl_rl.randomness import stream
 from popl_rl.raters.collector import collect_preferences, load_preferences
 from popl_rl.raters.groups import RaterGroup, make_groups
+from popl_rl.raters.pairs import training_pool
 from popl_rl.raters.people import Raters
 from popl_rl.raters.response import Response
 from popl_rl.raters.values import with_values
@@ -158,7 +159,11 @@ def make_data(
             groups, num_raters=raters.count, shares=raters.shares, generator=generator
         )
         preferences = collect_preferences(
-            buffer, people, answers_per_rater=raters.answers, generator=generator
+            buffer,
+            people,
+            answers_per_rater=raters.answers,
+            generator=generator,
+            pool=training_pool(segments),
         )[:].exclude("index")
     else:
         preferences = load_preferences(load / "preferences", num_segments=len(segments))

@@ -3,15 +3,16 @@
 import torch
 
 from popl_rl.config import Config
-from popl_rl.data.environments import World, is_stateless
+from popl_rl.data.environments import World, indexed, is_stateless
 from popl_rl.evaluation.acting import Acting, Choosing, Optimising, Planning, Rolling
 from popl_rl.evaluation.evaluator import Evaluator
-from popl_rl.experiments.builders import Data, build_bank, fresh_segments
+from popl_rl.experiments.data import Data, fresh_segments
+from popl_rl.keys import PAIR
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.raters.groups import RaterGroup
-from popl_rl.raters.pairs import starts_of
+from popl_rl.raters.pairs import held_out_pool
 
 __all__ = ["make_evaluator"]
 
@@ -46,7 +47,7 @@ def make_evaluator(
     device, options = config.device, config.evaluation
     if is_stateless(world.env):
         segments = fresh_segments(config.data, world, seed=seed, env=config.env)
-        bank = build_bank(segments, spec).to(device)
+        bank = spec.bank(indexed(segments, world.env.action_space)).to(device)
         segment_utility = torch.stack([group.segment_utility(segments) for group in groups])
         chooser = Choosing(segments, bank, options, seed=seed)
         return Evaluator(
@@ -59,7 +60,7 @@ def make_evaluator(
             shares=config.raters.shares,
             seed=seed,
         )
-    bank = build_bank(data.steps, spec).to(device)
+    bank = spec.bank(indexed(data.steps, world.env.action_space)).to(device)
     acting: Acting = Rolling(world, config.env, options, seed=seed)
     if isinstance(spec, RewardSpec):
         can_plan = world.table is not None and options.optimiser != "ppo"
@@ -74,7 +75,7 @@ def make_evaluator(
         groups,
         bank,
         data.segment_utility,
-        start=starts_of(data.steps),
+        pool=held_out_pool(data.steps, data.preferences[PAIR]),
         clone=clone,
         shares=config.raters.shares,
         seed=seed,

@@ -1,1 +1,11 @@
-"""models."""
+"""Hypotheses about what people want: networks, populations of them, and the sets that are returned.
+
+* ``policies``, ``reward_functions``, ``style_codes``: the kinds of hypotheses, and their sizes.
+* ``population``, ``style_population``: many of one kind as one stack of parameters; ``layers`` and
+  ``trunk_cache`` make it fast.
+* ``scoring``: scores of segments, margins of comparisons, values of cases.
+* ``preference_likelihood``, ``calibration``: how likely answers are, and how firm scores are.
+* ``hypothesis_set``, ``policy_set``, ``reward_set``: the result of training, catering to one
+  person, one for all; ``sets`` makes and reads a set of either kind.
+* ``schedules``: learning rates.
+"""

@@ -1,12 +1,10 @@
 """The result of training: a set of hypotheses, and choosing from it for one person or for all."""
 
 import json
-import shutil
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import ClassVar, Literal, Self, cast
+from typing import Any, ClassVar, Literal, Self, cast
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
@@ -21,7 +19,7 @@ from popl_rl.models.preference_likelihood import MISTAKE, log_likelihood
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.models.scoring import case_values, margins
 from popl_rl.selection.lexicase import lexicase_selection
-from popl_rl.storage import load_tensordict, save_tensordict
+from popl_rl.storage import load_tensordict, save_tensordict, written_beside
 
 __all__ = ["Catered", "HypothesisSet"]
 
@@ -172,31 +170,21 @@ class HypothesisSet:
         Raises:
             FileExistsError: If ``path`` exists.
         """
-        path = Path(path)
-        if path.exists():
-            raise FileExistsError(f"{path} exists; remove it or choose another path")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
-        try:
-            whole = beside / "set"
-            whole.mkdir()
-            population = self.population.plain()
-            save_tensordict(population.members.data, whole / "members")
-            trunk = {name: value.tolist() for name, value in population.trunk.state_dict().items()}
-            about = {
-                "format": f"popl_rl.{self._kind}_set/1",
-                "members": len(self),
-                "spec": asdict(cast("PolicySpec | RewardSpec", population.spec)),
-                "evolve": population.evolve,
-                "alpha": self.alpha,
-                "discount": self.discount,
-                "origin": self.origin,
-                "trunk": trunk,
-            }
-            (whole / f"{self._kind}_set.json").write_text(json.dumps(about))
-            whole.rename(path)
-        finally:
-            shutil.rmtree(beside, ignore_errors=True)
+        population = self.population.plain()
+        trunk = {name: value.tolist() for name, value in population.trunk.state_dict().items()}
+        about = {
+            "format": f"popl_rl.{self._kind}_set/1",
+            "members": len(self),
+            "spec": asdict(cast("PolicySpec | RewardSpec", population.spec)),
+            "evolve": population.evolve,
+            "alpha": self.alpha,
+            "discount": self.discount,
+            "origin": self.origin,
+            "trunk": trunk,
+        }
+        with written_beside(Path(path)) as beside:
+            save_tensordict(population.members.data, beside / "members")
+            (beside / f"{self._kind}_set.json").write_text(json.dumps(about))
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
@@ -217,7 +205,11 @@ class HypothesisSet:
             about = json.loads(about_path.read_text())
             if about["format"] != f"popl_rl.{cls._kind}_set/1":
                 raise ValueError(f"unknown format {about['format']!r}")
-            spec = cls._spec(**{**about["spec"], "hidden": tuple(about["spec"]["hidden"])})
+            sizes: dict[str, Any] = {  # JSON knows no tuples
+                name: tuple(value) if isinstance(value, list) else value
+                for name, value in about["spec"].items()
+            }
+            spec = cls._spec(**sizes)
             generator = torch.Generator().manual_seed(0)
             networks = [build_network(spec, generator=generator) for _ in range(about["members"])]
             population = Population(networks, spec, evolve=about["evolve"])

@@ -6,11 +6,13 @@ from typing import Any, Protocol
 
 import gymnasium
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torch.distributions import Categorical
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor
 
+from popl_rl.data.bank import SegmentBank
 from popl_rl.keys import ACTION, OBSERVATION
 
 __all__ = ["PolicySpec", "Spec", "build_actor", "build_network", "log_prob"]
@@ -25,6 +27,7 @@ class Spec(Protocol):
         hidden: Units of each hidden layer.
         discrete: Whether an action is a choice of one among the ``action_dim`` outputs.
         output_bias: Whether the last layer has a bias.
+        refines: Whether POPL's last training has been tried for this kind.
     """
 
     @property
@@ -37,6 +40,8 @@ class Spec(Protocol):
     def discrete(self) -> bool: ...  # noqa: D102
     @property
     def output_bias(self) -> bool: ...  # noqa: D102
+    @property
+    def refines(self) -> bool: ...  # noqa: D102
 
     def table(self, output: Tensor) -> Tensor:
         """What choosing each of the outputs adds to a segment's score, ``[..., K]``."""
@@ -44,6 +49,14 @@ class Spec(Protocol):
 
     def step_scores(self, output: Tensor, action: Tensor) -> Tensor:
         """What a step with this action adds to a segment's score, ``[...]``."""
+        ...
+
+    def conservatism(self, value: float) -> float:
+        """Lambda of the CPL loss for this kind of hypotheses, where the recipe says ``value``."""
+        ...
+
+    def bank(self, segments: TensorDictBase) -> SegmentBank:
+        """Segments ``[N, T]`` as hypotheses of this kind read them."""
         ...
 
 
@@ -107,6 +120,11 @@ class PolicySpec:
         return cls(observation.shape[0], size, discrete, tuple(hidden), action_std)
 
     @property
+    def refines(self) -> bool:
+        """Whether POPL's last training has been tried for this kind of hypotheses."""
+        return True
+
+    @property
     def output_bias(self) -> bool:
         """The last layer has a bias: it says which action is likely anywhere."""
         return True
@@ -118,6 +136,14 @@ class PolicySpec:
     def step_scores(self, output: Tensor, action: Tensor) -> Tensor:
         """See :func:`log_prob`."""
         return log_prob(self, output, action)
+
+    def conservatism(self, value: float) -> float:
+        """As the recipe says: it keeps policies near the data."""
+        return value
+
+    def bank(self, segments: TensorDictBase) -> SegmentBank:
+        """Observations and actions as they are."""
+        return SegmentBank.from_segments(segments)
 
 
 def build_network(spec: Spec, *, generator: torch.Generator) -> nn.Sequential:

@@ -104,10 +104,11 @@ class Population(nn.Module):
         return apply_layers(self.layers(), features)
 
     def layers(self) -> list[Layer]:
+        """The members' own layers, stacked: weights ``[N, K, F]`` and biases ``[N, K]``."""
         layers: list[Layer] = []
-        for position, activation in enumerate(self._activations):
-            if activation is not None:
-                layers.append(activation)
+        for position, between in enumerate(self._activations):
+            if between is not None:
+                layers.append(between)
                 continue
             layer = self.members[str(position)]
             layers.append((layer["weight"], layer.get("bias", None)))

@@ -22,6 +22,9 @@ def log_likelihood(margin: Tensor, mistake: float = MISTAKE) -> Tensor:
         margin: Margins of what was preferred over what was not, of any shape.
         mistake: Chance of a slip, in [0, 0.5).
 
+    Returns:
+        Log-likelihoods, in the shape of ``margin``.
+
     Raises:
         ValueError: If ``mistake`` is outside [0, 0.5).
     """
@@ -47,7 +50,7 @@ def leave_one_out(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
         comparisons: The M comparisons and the case of each.
 
     Returns:
-        ``[M]``.
+        Log-likelihood of each comparison under that member, ``[M]``.
     """
     others = per_case(likelihood, comparisons)[:, comparisons.case] - likelihood
     return likelihood.gather(0, others.argmax(0, keepdim=True))[0]

@@ -63,6 +63,11 @@ class RewardSpec:
         return True
 
     @property
+    def refines(self) -> bool:
+        """Whether POPL's last training has been tried for this kind of hypotheses."""
+        return False
+
+    @property
     def output_bias(self) -> bool:
         """There is none, see above."""
         return False
@@ -80,6 +85,14 @@ class RewardSpec:
         """
         chosen = action.expand(output.shape[:-1]).unsqueeze(-1)
         return output.gather(-1, chosen).squeeze(-1)
+
+    def conservatism(self, value: float) -> float:  # noqa: ARG002
+        """Always 1: of reward functions only differences mean something."""
+        return 1.0
+
+    def bank(self, segments: TensorDictBase) -> SegmentBank:
+        """See :func:`reward_bank`."""
+        return reward_bank(segments)
 
 
 def reward_bank(segments: TensorDictBase) -> SegmentBank:

@@ -201,7 +201,18 @@ def margins(
     alpha: float = 1.0,
     discount: float = 1.0,
 ) -> Tensor:
-    """Margins ``Delta = S(sigma+) - S(sigma-)`` of every member on every comparison, ``[N, M]``."""
+    """Margins ``Delta = S(sigma+) - S(sigma-)`` of every member on every comparison.
+
+    Args:
+        population: N members.
+        bank: Segments.
+        comparisons: M comparisons.
+        alpha: Scale of the scores.
+        discount: Per-step discount of the scores.
+
+    Returns:
+        ``[N, M]``.
+    """
     scores = segment_scores(population, bank, alpha=alpha, discount=discount)
     return scores[:, comparisons.preferred] - scores[:, comparisons.other]
 

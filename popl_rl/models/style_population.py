@@ -12,7 +12,9 @@ __all__ = ["StyledPopulation"]
 
 
 class StyledPopulation(Population):
-    """Members of a few numbers each, fed to a frozen :class:`~popl_rl.models.style_codes.StyleClone`.
+    """Members of a few numbers each, told to a frozen network.
+
+    See :class:`~popl_rl.models.style_codes.StyleClone` for the network.
 
     For a fixed code the clone is an ordinary policy network: what the code adds to the first layer
     is a bias. All other weights are shared, so scoring multiplies large matrices and a member is
@@ -44,6 +46,7 @@ class StyledPopulation(Population):
         self.members = TensorDictParams(TensorDict({"code": codes.clone()}, [len(codes)]))
 
     def layers(self) -> list[Layer]:
+        """The clone's layers, shared by all members but for the first bias, ``[N, H]``."""
         seen, told, bias = self.clone.first_layer()
         layers: list[Layer] = [(seen, bias + self.members["code"] @ told.T)]
         for layer in list(self.clone.network)[1:]:

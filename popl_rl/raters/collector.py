@@ -10,7 +10,7 @@ from torchrl.envs import Transform
 
 from popl_rl.data.segments import stored_segments
 from popl_rl.keys import ANSWER, GROUP, PAIR, RATER, UTILITY, Answer
-from popl_rl.raters.pairs import draw_pairs, starts_of
+from popl_rl.raters.pairs import PairPool, starts_of
 from popl_rl.raters.people import Raters
 from popl_rl.storage import load_tensordict
 
@@ -31,6 +31,8 @@ class PreferenceCollector(Transform):
         segments: Replay buffer of segments, one item each.
         raters: Who can be asked.
         generator: Source of the pairs and of the raters' randomness.
+        pool: What pairs are drawn from; if None, all pairs of segments from one state. Pairs that
+            you choose yourself may be any.
 
     Raises:
         ValueError: If there are fewer than two segments; when the buffer is extended, if a query
@@ -50,6 +52,7 @@ class PreferenceCollector(Transform):
         raters: Raters,
         *,
         generator: torch.Generator,
+        pool: PairPool | None = None,
     ) -> None:
         super().__init__(in_keys=[], out_keys=[])
         if len(segments) < 2:
@@ -60,7 +63,7 @@ class PreferenceCollector(Transform):
         #: Worth of each segment to each group, ``[G, N]``.
         steps = stored_segments(segments)
         self.segment_utility: Tensor = raters.segment_utility(steps)
-        self.start = starts_of(steps)
+        self.pool = PairPool(len(segments), starts_of(steps)) if pool is None else pool
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         rater = tensordict[RATER]
@@ -70,9 +73,7 @@ class PreferenceCollector(Transform):
             )
         pair = tensordict.get(PAIR, None)
         if pair is None:
-            pair = draw_pairs(
-                len(self.segments), len(rater), start=self.start, generator=self.generator
-            )
+            pair = self.pool.draw(len(rater), generator=self.generator)
         elif not ((pair >= 0) & (pair < len(self.segments))).all():
             raise ValueError(
                 f"pair must be segments in 0..{len(self.segments) - 1}, got {pair.min()}.."
@@ -96,8 +97,16 @@ def collect_preferences(
     *,
     answers_per_rater: int,
     generator: torch.Generator,
+    pool: PairPool | None = None,
 ) -> TensorDictReplayBuffer:
     """Ask every rater about the same number of random pairs.
+
+    Args:
+        segments: Replay buffer of segments, one item each.
+        raters: Who is asked.
+        answers_per_rater: Pairs that each rater is shown.
+        generator: Source of the pairs and of the raters' randomness.
+        pool: What pairs are drawn from, see :class:`PreferenceCollector`.
 
     Returns:
         Replay buffer of ``len(raters) * answers_per_rater`` preferences.
@@ -110,7 +119,7 @@ def collect_preferences(
     rater = torch.arange(len(raters)).repeat_interleave(answers_per_rater)
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(len(rater)),
-        transform=PreferenceCollector(segments, raters, generator=generator),
+        transform=PreferenceCollector(segments, raters, generator=generator, pool=pool),
         batch_size=min(256, len(rater)),
     )
     buffer.extend(TensorDict({RATER: rater}, [len(rater)]))

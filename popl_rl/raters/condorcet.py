@@ -24,12 +24,12 @@ def majority_preference(
         shares: Share of each group among the raters, summing to 1; equal if None.
 
     Returns:
-        Share of the raters who prefer thing i to thing j, float64 ``[N, N]``. Who finds both segment_utility
-        the same (within 1e-6) counts half, so that entries ij and ji sum to 1.
+        Share of the raters who prefer thing i to thing j, float64 ``[N, N]``. Who finds both
+        worth the same (within 1e-6) counts half, so that entries ij and ji sum to 1.
 
     Raises:
-        ValueError: If ``segment_utility`` is no table of finite numbers or ``shares`` are no shares of its
-            groups.
+        ValueError: If ``segment_utility`` is no table of finite numbers or ``shares`` are no
+            shares of its groups.
     """
     if (
         segment_utility.ndim != 2
@@ -37,8 +37,9 @@ def majority_preference(
         or not bool(segment_utility.isfinite().all())
     ):
         raise ValueError(
-            "segment_utility must be finite, of shape [groups, things] with at least one group, got shape "
-            f"{list(segment_utility.shape)} with {int((~segment_utility.isfinite()).sum())} NaN or infinite"
+            "segment_utility must be finite, of shape [groups, things] with at least one group, "
+            f"got shape {list(segment_utility.shape)} with "
+            f"{int((~segment_utility.isfinite()).sum())} NaN or infinite"
         )
     count = len(segment_utility)
     given = torch.full((count,), 1 / count) if shares is None else torch.as_tensor(shares)
@@ -67,8 +68,8 @@ def find_cycle(preferred: Tensor, *, threshold: float = 0.5) -> list[int] | None
 
     Args:
         preferred: Share of the raters who prefer thing i to thing j, ``[N, N]``, from
-            :func:`majority_preference`. Memory and time grow with N³; up to 200 things are a matter of a
-            second.
+            :func:`majority_preference`. Memory and time grow with N³; up to 200 things are a
+            matter of a second.
         threshold: Share that must be exceeded to beat another thing, at least 0.5.
 
     Returns:

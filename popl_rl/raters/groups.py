@@ -14,6 +14,7 @@ from torch import Tensor
 from popl_rl import registry
 from popl_rl.data import tables as planning
 from popl_rl.keys import ACTION, INFO, OBSERVATION
+from popl_rl.raters.checks import checked
 from popl_rl.raters.response import Response
 
 __all__ = ["Label", "RaterGroup", "Utility", "make_groups"]
@@ -35,8 +36,10 @@ class RaterGroup:
             assumption that CPL (arXiv 2310.13639) is derived from.
         advantages: ``[S, A]`` optimal advantages of the utility, for label="regret" where the
             environment has a transition table.
+        first_action: The action of the first column of ``advantages``.
         value: What a state is worth, observations ``[..., O]`` -> ``[...]``, for label="regret"
-            elsewhere; see :func:`popl_rl.raters.values.with_values`. None for "return", as ``advantages``.
+            elsewhere; see :func:`popl_rl.raters.values.with_values`.
+            None for "return", as ``advantages``.
 
     Raises:
         ValueError: If ``label`` is neither, or ``advantages`` and ``value`` do not go with it.
@@ -48,6 +51,7 @@ class RaterGroup:
     label: Label = "return"
     advantages: Tensor | None = None
     value: Callable[[Tensor], Tensor] | None = None
+    first_action: int = 0
 
     def __post_init__(self) -> None:
         if self.label not in ("regret", "return"):
@@ -62,7 +66,7 @@ class RaterGroup:
             )
 
     def step_utility(self, segments: TensorDictBase) -> Tensor:
-        """Return the utility of each step, float ``[B, T]``, checked.
+        """Return the utility of each step, float32 ``[B, T]``, checked.
 
         Args:
             segments: TensorDict of batch size ``[B, T]``; the ``[S, A]`` steps of a table will do.
@@ -78,27 +82,7 @@ class RaterGroup:
                 f"rater {self.name!r} failed on segments of batch size "
                 f"{list(segments.batch_size)} with {type(error).__name__}: {error}"
             ) from error
-        if not isinstance(result, Tensor):
-            raise TypeError(
-                f"rater {self.name!r} must return a float tensor of shape "
-                f"{list(segments.batch_size)}, got a {type(result).__name__}."
-            )
-        if result.shape != segments.batch_size:
-            raise ValueError(
-                f"rater {self.name!r} must return one utility per step, shape "
-                f"{list(segments.batch_size)}, got shape {list(result.shape)}"
-                f"{_shape_cure(result, segments)}."
-            )
-        if not result.is_floating_point():
-            raise TypeError(
-                f"rater {self.name!r} must return floats, got {result.dtype}; call .float() on it."
-            )
-        if not bool(result.isfinite().all()):
-            raise ValueError(
-                f"rater {self.name!r} must return finite numbers, got "
-                f"{int((~result.isfinite()).sum())} NaN or infinite of {result.numel()}."
-            )
-        return result
+        return checked(result, segments, rater=self.name)
 
     def perceived_utility(self, segments: TensorDictBase) -> Tensor:
         """Return the worth of each step by which this group compares, float ``[N, T]``.
@@ -125,18 +109,19 @@ class RaterGroup:
                 f"rater {self.name!r} labels by regret, which needs ('info', 'state') in segments; "
                 "let the environment's info hold 'state', or use label='return'."
             )
-        state, action = segments[INFO, "state"].long(), segments[ACTION].long()
+        state, action = segments[INFO, "state"].long(), segments[ACTION].long() - self.first_action
         states, actions = self.advantages.shape
         if state.shape != action.shape:
             raise ValueError(
                 f"rater {self.name!r} labels by regret, which needs discrete actions of shape "
                 f"{list(state.shape)}, got {list(action.shape)}; use label='return'."
             )
-        if bool((state < 0).any() | (state >= states).any() | (action >= actions).any()):
+        strange = (state < 0) | (state >= states) | (action < 0) | (action >= actions)
+        if bool(strange.any()):
             raise ValueError(
                 f"rater {self.name!r} knows {states} states and {actions} actions, got state "
-                f"{int(state.max())} and action {int(action.max())}; take segments and transition "
-                "table from the same environment."
+                f"{int(state[strange][0])} and the action of number {int(action[strange][0])}, "
+                "counted from 0; take segments and transition table from the same environment."
             )
         return self.advantages.to(state.device)[state, action]
 
@@ -216,13 +201,14 @@ def make_groups(
         if label != "return":
             # Past the check above a table is there unless the label is wrong, which RaterGroup
             # reports.
-            advantages = None
+            advantages, first = None, 0
             if table is not None:
+                first = int(table.steps[ACTION][0, 0])
                 reward = group.step_utility(table.steps).double()
                 advantages, _ = planning.solve(
                     table, reward, discount=discount, temperature=temperature
                 )
-            group = RaterGroup(name, utility, own, label, advantages)
+            group = RaterGroup(name, utility, own, label, advantages, first_action=first)
         groups.append(group)
     return tuple(groups)
 
@@ -235,11 +221,3 @@ def _named(reference: str | Utility) -> tuple[str, Utility]:
             f"a rater must be a reference or a function, got a {type(reference).__name__}."
         )
     return getattr(reference, "__name__", type(reference).__name__), reference
-
-
-def _shape_cure(result: Tensor, segments: TensorDictBase) -> str:
-    if result.ndim > 2 and result.shape[:2] == segments.batch_size:
-        return "; reduce the last dimension, as in .sum(-1)"
-    if result.shape == segments.batch_size[:1]:
-        return "; give each step its utility instead of one number per segment"
-    return ""

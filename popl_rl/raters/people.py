@@ -110,7 +110,8 @@ class Raters:
         Args:
             pairs: ``[M, 2]`` int64, rows of the two segments.
             rater: ``[M]`` int64, who is asked.
-            segment_utility: ``[G, N]`` float, what each segment is segment_utility to each group, from :meth:`segment_utility`.
+            segment_utility: ``[G, N]`` float, what each segment is worth to each group, from
+                :meth:`segment_utility`.
             generator: Source of randomness, on the device of ``segment_utility``.
 
         Returns:

@@ -7,6 +7,12 @@ __all__ = ["DTYPES", "check_count", "check_generator", "check_scores"]
 
 
 def check_scores(scores: Tensor, name: str = "scores") -> None:
+    """Check that scores are a matrix ``[member, case]`` of comparable numbers.
+
+    Raises:
+        TypeError: If they are no tensor, or of a dtype without an order.
+        ValueError: If they are not a matrix, are empty or contain NaN.
+    """
     if not isinstance(scores, Tensor):
         raise TypeError(f"{name} must be a torch.Tensor, got {type(scores).__name__}")
     if scores.dtype not in DTYPES:
@@ -28,6 +34,12 @@ def check_scores(scores: Tensor, name: str = "scores") -> None:
 
 
 def check_count(name: str, count: int, most: int | None) -> None:
+    """Check that a number of cases or parents is from 1 to ``most``, the number of cases.
+
+    Raises:
+        TypeError: If it is no int.
+        ValueError: If it is out of range.
+    """
     if isinstance(count, bool) or not isinstance(count, int):
         raise TypeError(f"{name} must be an int, got {type(count).__name__}")
     if count < 1 or (most is not None and count > most):
@@ -38,6 +50,12 @@ def check_count(name: str, count: int, most: int | None) -> None:
 def check_generator(
     generator: torch.Generator, device: torch.device | None = None, name: str = "scores"
 ) -> None:
+    """Check that a generator is one, and on the device of the tensor called ``name``.
+
+    Raises:
+        TypeError: If it is no generator.
+        ValueError: If it is on another device.
+    """
     if not isinstance(generator, torch.Generator):
         raise TypeError(
             f"generator must be a torch.Generator, got {type(generator).__name__}; make one with "
@@ -50,6 +68,7 @@ def check_generator(
         )
 
 
+#: Dtypes of scores: all whose values can be compared.
 DTYPES = (
     torch.bool,
     *(torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64),

@@ -15,11 +15,9 @@ import torch
 from torch import Tensor
 
 from popl_rl.selection.arguments import check_count, check_generator, check_scores
+from popl_rl.selection.farthest_first import farthest_first
 
 __all__ = ["downsample", "informed_downsample", "spread_out"]
-
-# Candidates examined together: enough to fill a matrix product, few enough to fit into memory.
-_BATCH = 64
 
 
 def downsample(num_cases: int, num_kept: int, *, generator: torch.Generator) -> Tensor:
@@ -87,25 +85,13 @@ def informed_downsample(
     sample = torch.randperm(len(passes), generator=generator, device=passes.device)[:num_members]
     # With solve vectors of -1 and 1, [case, member], distance falls as the dot product grows.
     vectors = (2.0 * passes[sample].T - 1.0).contiguous()
-    likeness = torch.full((num_cases,), -torch.inf, device=passes.device)  # to the nearest kept
-    kept = passes.new_empty(0, dtype=torch.long)
-    while len(kept) < num_kept:
-        # The farthest cases are visited in random order. One that is no longer as far, because of
-        # another taken just before it, is passed over: as if each were drawn after the other.
-        level = likeness.min()
-        farthest = (likeness == level).nonzero().view(-1)
-        order = torch.randperm(len(farthest), generator=generator, device=passes.device)
-        visited = farthest[order[:_BATCH]]
-        apart = (vectors[visited] @ vectors[visited].T <= level).tolist()
-        taken: list[int] = []
-        for candidate in range(len(visited)):
-            if all(apart[candidate][other] for other in taken):
-                taken.append(candidate)
-        new = visited[taken[: num_kept - len(kept)]]
-        kept = torch.cat([kept, new])
-        likeness = torch.maximum(likeness, (vectors @ vectors[new].T).amax(1))
-        likeness[kept] = torch.inf
-    return kept
+    return farthest_first(
+        lambda some, others: vectors[some] @ vectors[others].T,
+        num_cases,
+        num_kept,
+        generator=generator,
+        device=passes.device,
+    )
 
 
 def spread_out(similarity: Tensor, count: int, *, generator: torch.Generator) -> Tensor:
@@ -114,17 +100,19 @@ def spread_out(similarity: Tensor, count: int, *, generator: torch.Generator) ->
     As informed down-sampling does with cases (Boldi et al., 2024), it keeps what is rare in sight.
 
     Args:
-        similarity: Correlations ``[C, C]``.
-        count: Raters to choose, at least 1; more than C repeat.
+        similarity: Correlations ``[rater, rater]``.
+        count: Raters to choose, at least 1; more than there are repeat.
         generator: Source of the first one.
 
     Returns:
-        ``[count]``.
+        Indices of raters in the order in which they were chosen, ``[count]``, int64.
     """
     start = int(torch.randint(len(similarity), (), generator=generator, device=generator.device))
-    chosen, nearest = [start], similarity[start].clone()
-    for _ in range(count - 1):
-        farthest = int(nearest.argmin())
-        chosen.append(farthest)
-        nearest = torch.maximum(nearest, similarity[farthest])
-    return torch.tensor(chosen, device=similarity.device)
+    return farthest_first(
+        lambda some, others: similarity[others][:, some].T,
+        len(similarity),
+        count,
+        first=start,
+        repeat=True,
+        device=similarity.device,
+    )

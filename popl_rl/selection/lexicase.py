@@ -26,7 +26,11 @@ import torch
 from torch import Tensor
 
 from popl_rl.selection.arguments import check_count, check_generator, check_scores
-from popl_rl.selection.pools import Epsilon, PassPools, Round, ScorePools, select_dynamically
+from popl_rl.selection.behaviours import label_behaviours
+from popl_rl.selection.dynamic_epsilon import select_dynamically
+from popl_rl.selection.epsilon import Epsilon, prepare_scores, tolerance_per_case
+from popl_rl.selection.pools import PassPools, ScorePools
+from popl_rl.selection.rounds import Round
 
 __all__ = ["SelectionReport", "lexicase_given_first", "lexicase_report", "lexicase_selection"]
 
@@ -140,8 +144,8 @@ def lexicase_report(
         )
     check_generator(generator, scores.device)
 
-    scores, tolerance = _prepare(scores.detach(), epsilon, epsilon_mode)
-    labels, first = _label_behaviours(scores)
+    scores, tolerance = prepare_scores(scores.detach(), epsilon, epsilon_mode)
+    labels, first = label_behaviours(scores)
     behaviours = scores if len(first) == len(scores) else scores[first]
     limit = num_cases if cases_per_selection is None else cases_per_selection
     if epsilon_mode == "dynamic" and epsilon == "mad" and tolerance is not None:
@@ -204,7 +208,7 @@ def lexicase_given_first(
     if first.ndim != 1 or not len(first) or not bool(((first >= 0) & (first < num_cases)).all()):
         raise ValueError(f"first must hold cases in 0..{num_cases - 1}, [selection], got {first}")
     check_generator(generator, scores.device)
-    tolerance = _tolerance(0.0 if epsilon is None else epsilon, scores)
+    tolerance = tolerance_per_case(0.0 if epsilon is None else epsilon, scores)
     values = scores.to(tolerance.dtype)
     parents, depth = torch.empty_like(first), torch.empty_like(first)
     cases, group = first.unique(return_inverse=True)
@@ -216,112 +220,6 @@ def lexicase_given_first(
         rest = lexicase_report(values[pool], len(mine), epsilon=tolerance, generator=generator)
         parents[mine] = pool[rest.parents]
         depth[mine] = rest.depth + int(len(pool) < len(scores))
-    labels, behaviours = _label_behaviours(scores)
+    labels, behaviours = label_behaviours(scores)
     shares = labels[parents].bincount() / len(parents)
     return SelectionReport(parents, depth, len(behaviours), 1 / float(shares.square().sum()))
-
-
-def _prepare(
-    scores: Tensor, epsilon: float | Tensor | str | None, mode: str
-) -> tuple[Tensor, Tensor | None]:
-    """Reduce the kinds of scores and epsilon to passes, or real scores and a tolerance per case.
-
-    The tolerance is NaN where the median absolute deviation is still to be worked out, and None
-    for plain lexicase selection.
-    """
-    if scores.dtype in (torch.float16, torch.bfloat16):
-        scores = scores.float()
-    if epsilon is None:
-        return scores, None
-    tolerance = _tolerance(epsilon, scores)
-    if scores.dtype == torch.bool:
-        # A fail trails a pass by 1, and the median absolute deviation of passes is at most 1/2.
-        return scores | (tolerance >= 1), None
-    scores = scores.to(tolerance.dtype)
-    if mode != "static":
-        return scores, tolerance
-    everywhere = torch.arange(scores.shape[1], device=scores.device)
-    return scores >= scores.amax(0) - Epsilon(tolerance, scores).at(everywhere), None
-
-
-def _tolerance(epsilon: float | Tensor | str, scores: Tensor) -> Tensor:
-    """Check epsilon and spread it over the cases, ``[case]``."""
-    num_cases = scores.shape[1]
-    dtype = scores.dtype if scores.dtype.is_floating_point else torch.float64
-    if isinstance(epsilon, str):
-        if epsilon != "mad":
-            raise ValueError(f"epsilon must be a number, a tensor, 'mad' or None, got {epsilon!r}")
-        if dtype == scores.dtype and any(bool(end.isinf()) for end in scores.aminmax()):
-            raise ValueError(
-                "scores must be finite if epsilon is 'mad', got infinite ones; clamp them or give "
-                "epsilon as a number"
-            )
-        return torch.full((num_cases,), torch.nan, dtype=dtype, device=scores.device)
-    if isinstance(epsilon, bool) or not isinstance(epsilon, (int, float, Tensor)):
-        raise TypeError(
-            f"epsilon must be a number, a tensor, 'mad' or None, got {type(epsilon).__name__}"
-        )
-    tolerance = torch.as_tensor(epsilon, dtype=dtype, device=scores.device).detach()
-    if tolerance.ndim and tolerance.shape != (num_cases,):
-        raise ValueError(
-            f"epsilon must be a number or one tolerance per case, shape ({num_cases},), got shape "
-            f"{tuple(tolerance.shape)}"
-        )
-    tolerance = tolerance.expand(num_cases)
-    if not bool((tolerance >= 0).all()) or bool(tolerance.isinf().any()):
-        raise ValueError(
-            f"epsilon must be finite and at least 0, got {float(tolerance.min())} to "
-            f"{float(tolerance.max())}"
-        )
-    return tolerance
-
-
-def _label_behaviours(scores: Tensor) -> tuple[Tensor, Tensor]:
-    """Number the distinct rows: label of each member, and the first member with each label."""
-    num_members, num_cases = scores.shape
-    everyone = torch.arange(num_members, device=scores.device)
-    for width in (256, num_cases):  # a few cases mostly suffice to tell everybody apart
-        labels: Tensor = torch.unique(_fingerprints(scores[:, :width]), return_inverse=True)[1]
-        if int(labels.max()) + 1 == num_members:
-            return everyone, everyone
-        if width >= num_cases:
-            break
-    first = _first_with(labels)
-    twins = (first[labels] != everyone).nonzero().view(-1)
-    for some in torch.split(twins, _rows_at_once(scores)):
-        if not torch.equal(scores[some], scores[first[labels[some]]]):  # fingerprints have clashed
-            labels = torch.unique(scores, dim=0, return_inverse=True)[1]
-            return labels, _first_with(labels)
-    return labels, first
-
-
-def _first_with(labels: Tensor) -> Tensor:
-    """First member with each label."""
-    everyone = torch.arange(len(labels), device=labels.device)
-    return everyone.new_zeros(int(labels.max()) + 1).scatter_reduce(
-        0, labels, everyone, "amin", include_self=False
-    )
-
-
-def _fingerprints(scores: Tensor) -> Tensor:
-    """Hash each row to 64 bits, ``[member]``: a random linear function of its 8-byte words."""
-    generator = torch.Generator().manual_seed(0)  # the result must not depend on the caller's
-    num_bytes = scores.shape[1] * scores.element_size()
-    shape = (-(-num_bytes // 8),)
-    factors = torch.randint(-(2**63), 2**63 - 1, shape, generator=generator).to(scores.device)
-    prints = []
-    for part in torch.split(scores, _rows_at_once(scores)):
-        if part.dtype.is_floating_point:
-            part = part + 0.0  # -0.0 equals 0.0 but has other bits
-        words = part.contiguous().view(torch.uint8)
-        if num_bytes % 8:
-            words = torch.nn.functional.pad(words, (0, -num_bytes % 8))
-        words = words.view(torch.int64)
-        # A product keeps the low bits of a word apart, not the high ones: fold those in first.
-        prints.append(((words ^ ((words >> 32) & 0xFFFFFFFF)) * factors).sum(1))
-    return torch.cat(prints)
-
-
-def _rows_at_once(scores: Tensor) -> int:
-    """Rows that fit into a processor's cache together, at least one."""
-    return max(1, 2**19 // (scores.shape[1] * scores.element_size()))

@@ -20,10 +20,11 @@ __all__ = [
     "SELECTIONS",
     "Selection",
     "best_sum_selection",
+    "fronts_and_crowding",
     "nsga2_selection",
     "random_selection",
     "report",
-    "selection_of",
+    "selection_rule",
     "tournament_selection",
 ]
 
@@ -140,15 +141,26 @@ def nsga2_selection(values: Tensor, num_selected: int, *, generator: torch.Gener
             installed.
     """
     _check(values, num_selected, generator)
-    front, crowding = _fronts(values)
+    front, crowding = fronts_and_crowding(values)
     pair = _draw(len(values), (num_selected, 2), values, generator)
     (first, second), (one, other) = front[pair].T, crowding[pair].T
     second_wins = (second < first) | ((second == first) & (other > one))
     return pair.gather(1, second_wins.long().unsqueeze(1)).squeeze(1)
 
 
-def _fronts(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Non-dominated front of each member, counted from 0, and crowding distance in it."""
+def fronts_and_crowding(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Sort members into non-dominated fronts, as NSGA-II does (Deb et al., 2002).
+
+    Args:
+        values: ``[member, case]``, higher is better.
+
+    Returns:
+        Front of each member, counted from 0, ``[member]``, and its crowding distance among the
+        members of that front, ``[member]``, infinite at the ends.
+
+    Raises:
+        ValueError: If pymoo is not installed.
+    """
     _require_pymoo()
     from pymoo.operators.survival.rank_and_crowding.metrics import calc_crowding_distance
     from pymoo.util.nds.non_dominated_sorting import NonDominatedSorting
@@ -178,7 +190,7 @@ SELECTIONS: dict[str, Callable[..., Tensor]] = {
 """Rules by name."""
 
 
-def selection_of(name: str, *, tournament: int = 4) -> Selection | None:
+def selection_rule(name: str, *, tournament: int = 4) -> Selection | None:
     """Rule of a name; None stands for lexicase selection.
 
     Args:

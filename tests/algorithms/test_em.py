@@ -5,20 +5,28 @@ import math
 import pytest
 import torch
 
-from popl_rl.algorithms.em import EM, case_likelihood, responsibility
-from popl_rl.config import MethodConfig
-from popl_rl.experiments.builders import build_popl, final_set
+from popl_rl.algorithms.em import EM
+from popl_rl.algorithms.expectation import expect
+from popl_rl.algorithms.problem import Problem
+from popl_rl.config import EMSettings, Training
 from popl_rl.models.policies import PolicySpec
+from popl_rl.models.preference_likelihood import log_likelihood, per_case
 from popl_rl.models.scoring import case_values, margins
 
 SPEC = PolicySpec(5, 2, True, (6,))
 
 
-def build(bank, comparisons, *, seed=0, **settings):
-    settings = {"members": 4, "groups": 2, "generations": 4, "steps": 3, **settings}
-    config = MethodConfig(algorithm="em", hidden=[6], batch_size=16, **settings)
+def build(bank, comparisons, *, seed=0, members=4, groups=2, generations=4, **recipe):
+    training = Training(**{"steps": 12, "batch_size": 16, "slip": 0.0, **recipe})
+    problem = Problem(SPEC, bank, comparisons, training, members=members, generations=generations)
     generator = torch.Generator().manual_seed(seed)
-    return build_popl(config, SPEC, bank, comparisons, generator=generator)
+    return EM(problem, em=EMSettings(groups=groups), generator=generator)
+
+
+def given_margins(monkeypatch, margin):
+    """Have everybody score preferred segments so, and all others 0."""
+    scores = torch.cat([margin, torch.zeros_like(margin)], 1)
+    monkeypatch.setattr(Problem, "scores", lambda *_: scores)
 
 
 def tensors(popl):
@@ -30,8 +38,8 @@ def tensors(popl):
 
 def two_raters(comparisons):
     """Three answers: two of the first rater, one of the second."""
-    case = torch.tensor([0, 0, 1])
-    return type(comparisons)(comparisons.preferred[:3], comparisons.other[:3], case, 2)
+    row = torch.arange(3)
+    return type(comparisons)(row, row + 3, torch.tensor([0, 0, 1]), 2)
 
 
 #: Margins under which two policies give the three answers with these chances.
@@ -40,16 +48,26 @@ CHANCES = torch.tensor([[0.8, 0.5, 0.3], [0.4, 0.5, 0.9]])
 
 def test_a_raters_likelihood_is_the_product_over_its_answers(comparisons):
     """0.8 * 0.5 = 0.4 and 0.4 * 0.5 = 0.2; the second rater's one answer has 0.3 and 0.9."""
-    likelihood = case_likelihood(CHANCES.logit(), two_raters(comparisons))
+    likelihood = per_case(log_likelihood(CHANCES.logit(), 0.0), two_raters(comparisons))
     torch.testing.assert_close(likelihood.exp(), torch.tensor([[0.4, 0.3], [0.2, 0.9]]))
 
 
 def test_responsibilities_by_hand():
     """With shares 3/4 and 1/4: 0.3 against 0.05 is 6/7, and 0.225 against 0.225 is a half."""
     likelihood = torch.tensor([[[0.4, 0.3], [0.2, 0.9]]])
-    joint = likelihood.log() + torch.tensor([[0.75, 0.25]]).log().unsqueeze(-1)
+    found = expect(likelihood.log(), torch.tensor([[0.75, 0.25]]))
     expected = torch.tensor([[[6 / 7, 0.5], [1 / 7, 0.5]]])
-    torch.testing.assert_close(responsibility(joint), expected)
+    torch.testing.assert_close(found.responsibility, expected)
+    torch.testing.assert_close(found.evidence.exp(), torch.tensor([[0.35, 0.45]]))
+
+
+def test_components_out_of_use_have_no_part():
+    """The second component explains all better, but is not there."""
+    likelihood = torch.tensor([[[0.2], [0.9]]]).log()
+    active = torch.tensor([[True, False]])
+    found = expect(likelihood, torch.tensor([[1.0, 0.0]]), active=active)
+    assert found.responsibility.tolist() == [[[1.0], [0.0]]]
+    torch.testing.assert_close(found.evidence.exp(), torch.tensor([[0.2]]))
 
 
 def test_a_generation_by_hand(monkeypatch, bank, comparisons):
@@ -63,7 +81,7 @@ def test_a_generation_by_hand(monkeypatch, bank, comparisons):
     popl = build(bank, said)
     equal = torch.full((2, 3), 0.1)
     margin = torch.cat([CHANCES, equal]).logit()
-    monkeypatch.setattr("popl_rl.algorithms.multi_cpl.margins", lambda *_, **__: margin)
+    given_margins(monkeypatch, margin)
     given = []
 
     def trained(parents, weight):
@@ -86,7 +104,7 @@ def test_a_component_without_a_share_may_come_back(monkeypatch, bank, comparison
     popl = build(bank, two_raters(comparisons), members=2)
     popl.share = torch.tensor([[1.0, 0.0]])
     margin = torch.tensor([[-20.0] * 3, [5.0] * 3])
-    monkeypatch.setattr("popl_rl.algorithms.multi_cpl.margins", lambda *_, **__: margin)
+    given_margins(monkeypatch, margin)
     popl.step()
     assert popl.share[0, 1] > 0.99
 
@@ -99,21 +117,28 @@ def test_as_many_starts_as_there_is_room_for(bank, comparisons, members, told, s
     assert isinstance(popl, EM)
     assert tuple(popl.share.shape) == shape
     assert len(popl.population) == shape[0] * shape[1]
-    assert len(final_set(popl)) == told
+    assert len(popl.result()) == told
 
 
-def test_mixtures_must_be_whole(bank, comparisons):
-    popl = build(bank, comparisons)
-    parts = (popl.population, bank, comparisons)
-    message = r"population must hold mixtures of groups=3 policies each, got 4 policies"
-    with pytest.raises(ValueError, match=message):
-        EM(*parts, groups=3, training=popl.training, generator=popl.generator)
+@pytest.mark.parametrize("told", [None, 0])
+def test_the_number_of_groups_must_be_told(bank, comparisons, told):
+    with pytest.raises(ValueError, match=r"em\.groups must be a number of at least 1, got"):
+        build(bank, comparisons, groups=told)
+
+
+def test_slips_soften_what_one_answer_says(monkeypatch, bank, comparisons):
+    """Odds of 0.99 against 0.01 become 0.95 0.99 + 0.05 0.01 = 0.941 against 0.059."""
+    one = type(comparisons)(torch.tensor([0]), torch.tensor([1]), torch.tensor([0]), 1)
+    popl = build(bank, one, members=2, slip=0.05)
+    given_margins(monkeypatch, torch.tensor([[0.99], [0.01]]).logit())
+    popl.step()
+    torch.testing.assert_close(popl.share, torch.tensor([[0.941, 0.059]]))
 
 
 def test_the_likeliest_start_is_the_result(monkeypatch, bank, comparisons):
     popl = build(bank, comparisons)
     monkeypatch.setattr(popl, "likelihood", lambda: torch.tensor([-2.0, -1.0]))
-    found = final_set(popl)
+    found = popl.result()
     assert found.origin == [2, 3]
     members = popl.population.members.data
     kept = found.population.members.data
@@ -122,9 +147,18 @@ def test_the_likeliest_start_is_the_result(monkeypatch, bank, comparisons):
 
 def test_two_obvious_groups_are_found(bank, comparisons):
     """Four raters want to be left and four right; each component ends with one group."""
-    popl = build(bank, comparisons, members=8, generations=12, steps=15, learning_rate=0.02)
+    popl = build(
+        bank,
+        comparisons,
+        members=8,
+        generations=12,
+        steps=180,
+        learning_rate=0.02,
+        alpha=0.5,
+        conservatism=0.9,
+    )
     metrics = [popl.step() for _ in range(12)]
-    found = final_set(popl)
+    found = popl.result()
     values = case_values(
         margins(found.population, bank, comparisons, alpha=found.alpha) > 0, comparisons
     )
@@ -157,4 +191,4 @@ def test_continuing_is_as_never_having_stopped(bank, comparisons):
     resumed.load_state_dict(state)
     assert [resumed.step() for _ in range(3)] == expected
     assert all(map(torch.equal, tensors(straight), tensors(resumed)))
-    assert final_set(straight).origin == final_set(resumed).origin
+    assert straight.result().origin == resumed.result().origin

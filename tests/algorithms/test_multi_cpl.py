@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from popl_rl.algorithms.multi_cpl import MultiCPL
-from popl_rl.config import MethodConfig
-from popl_rl.experiments.builders import build_popl, final_set, generations_of, label_of
+from popl_rl.algorithms.problem import Problem
+from popl_rl.config import Training
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.models.reward_set import RewardSet
@@ -15,11 +15,10 @@ from popl_rl.models.reward_set import RewardSet
 SPEC = PolicySpec(5, 2, True, (6,))
 
 
-def build(bank, comparisons, *, seed=0, spec=SPEC, **settings):
-    settings = {"algorithm": "multi_cpl", "members": 3, "generations": 4, "steps": 5, **settings}
-    config = MethodConfig(hidden=[6], batch_size=16, **settings)
-    generator = torch.Generator().manual_seed(seed)
-    return build_popl(config, spec, bank, comparisons, generator=generator)
+def build(bank, comparisons, *, seed=0, spec=SPEC, members=3, generations=4, **recipe):
+    training = Training(**{"steps": 5 * generations, "batch_size": 16, **recipe})
+    problem = Problem(spec, bank, comparisons, training, members=members, generations=generations)
+    return MultiCPL(problem, generator=torch.Generator().manual_seed(seed))
 
 
 def parameters_of(popl):
@@ -45,31 +44,24 @@ def test_what_it_reports_is_what_it_found_by_hand(monkeypatch, bank, comparisons
     The best member for the first rater passes both answers, for the second one of two: the 10 %
     quantile of (1, 1/2) is 0.55.
     """
-    four = type(comparisons)(
-        comparisons.preferred[:4], comparisons.other[:4], torch.tensor([0, 0, 1, 1]), 2
-    )
+    row = torch.arange(4)
+    four = type(comparisons)(row, row + 4, torch.tensor([0, 0, 1, 1]), 2)
     popl = build(bank, four, members=2)
     margin = torch.tensor([[1.0, 2.0, 1.0, -1.0], [-1.0, 0.0, 1.0, -1.0]])
-    monkeypatch.setattr("popl_rl.algorithms.multi_cpl.margins", lambda *_, **__: margin)
+    scores = torch.cat([margin, torch.zeros_like(margin)], 1)
+    monkeypatch.setattr(Problem, "scores", lambda *_: scores)
     metrics = popl.step()
     assert metrics["worst_rater_accuracy"] == pytest.approx(0.55)
     assert metrics["mean_accuracy"] == 0.5
 
 
-def test_one_of_them_is_pooled_cpl(bank, comparisons):
-    single = build(bank, comparisons, algorithm="cpl", members=7)
-    assert len(single.population) == 1
-    again = build(bank, comparisons, members=1)
-    assert [single.step() for _ in range(2)] == [again.step() for _ in range(2)]
-
-
 def test_pooled_policies_are_better_than_chance_for_everybody_together(bank, comparisons):
     """Left and right want opposite things, so that pooled policies are at best right by half."""
-    popl = build(bank, comparisons, generations=8, steps=15, learning_rate=0.02)
+    popl = build(bank, comparisons, generations=8, steps=120, learning_rate=0.02)
     metrics = [popl.step() for _ in range(8)]
     assert metrics[-1]["loss_cpl"] < metrics[0]["loss_cpl"]
     one_group = comparisons.rows(comparisons.case < 4)
-    alone = build(bank, one_group, generations=8, steps=15, learning_rate=0.02)
+    alone = build(bank, one_group, generations=8, steps=120, learning_rate=0.02)
     learnt = [alone.step() for _ in range(8)]
     assert learnt[-1]["mean_accuracy"] > 0.8
     assert metrics[-1]["mean_accuracy"] < learnt[-1]["mean_accuracy"] - 0.1
@@ -102,27 +94,13 @@ def test_continuing_is_as_never_having_stopped(bank, comparisons):
 def test_the_set_is_everybody_who_differs(bank, comparisons):
     popl = build(bank, comparisons)
     popl.step()
-    assert 1 <= len(final_set(popl)) <= 3
+    assert 1 <= len(popl.result()) <= 3
     popl.population.replace_(torch.tensor([1, 1, 1]))
-    assert len(final_set(popl)) == 1
+    assert len(popl.result()) == 1
 
 
 def test_reward_functions_learn_alike(bank, comparisons):
     popl = build(bank, comparisons, spec=RewardSpec(5, 2, (6,)))
     assert popl.training.loss.conservatism == 1
     popl.step()
-    assert isinstance(final_set(popl), RewardSet)
-
-
-def test_a_run_takes_as_many_blocks_as_popl_has_generations():
-    """Teams alone count otherwise, whatever the cases are."""
-    config = MethodConfig(algorithm="multi_cpl", cases="preference")
-    assert generations_of(config) == config.generations
-    assert generations_of(MethodConfig(cases="preference")) == config.team_generations
-
-
-@pytest.mark.parametrize(
-    ("algorithm", "label"), [("popl", "popl"), ("cpl", "multi_cpl"), ("em", "em"), ("vpl", "vpl")]
-)
-def test_rows_are_called_after_the_algorithm_and_never_as_the_baseline(algorithm, label):
-    assert label_of(MethodConfig(algorithm=algorithm)) == label
+    assert isinstance(popl.result(), RewardSet)

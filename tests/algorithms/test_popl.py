@@ -5,18 +5,20 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from popl_rl.algorithms.losses import CPLLoss
 from popl_rl.algorithms.popl import POPL
+from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.variation import GaussianHead, GradientCPL
-from popl_rl.config import DataConfig, EnvConfig, MethodConfig, RatersConfig
+from popl_rl.config import DataConfig, EnvConfig, MethodConfig, RatersConfig, Training
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.data.environments import build_world
 from popl_rl.evaluation.measures import group_accuracy, held_out_pairs
-from popl_rl.experiments.builders import build_groups, build_popl, make_data, stream
+from popl_rl.experiments.builders import build_method, build_problem
+from popl_rl.experiments.data import build_groups, make_data
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.population import Population
 from popl_rl.models.scoring import case_values, margins, rater_accuracy, segment_scores
+from popl_rl.randomness import stream
 from popl_rl.selection.mad import mad
 
 
@@ -24,22 +26,22 @@ def make(bank, comparisons, *, variation="gradient", seed=0, members=6, epsilon=
     """A small POPL on the line of five cells."""
     generator = torch.Generator().manual_seed(seed)
     evolve = "head" if variation == "gaussian" else "all"
-    population = Population.create(
-        PolicySpec(5, 2, True, (8,)), members, evolve=evolve, generator=generator
+    problem = Problem(
+        PolicySpec(5, 2, True, (8,)),
+        bank,
+        comparisons,
+        Training(steps=20, batch_size=16),
+        evolve=evolve,
+        members=members,
+        generations=10,
     )
+    population = problem.initial_population(members, generator=generator)
     if variation == "gaussian":
         varied = GaussianHead(population, generator=generator)
     else:
-        varied = GradientCPL(
-            CPLLoss(population, bank),
-            comparisons,
-            generations=10,
-            steps=2,
-            batch_size=16,
-            generator=generator,
-        )
+        varied = GradientCPL.of(problem, population, generator=generator)
     return POPL(
-        population, bank, comparisons, variation=varied, epsilon=epsilon, generator=generator
+        problem, population=population, variation=varied, epsilon=epsilon, generator=generator
     )
 
 
@@ -143,13 +145,18 @@ class Remember:
 
 def one_generation(monkeypatch, bank, margin, comparisons, epsilon):
     """Run a generation on given margins; return what the variation was told, and the scalars."""
-    monkeypatch.setattr("popl_rl.algorithms.popl.margins", lambda *_, **__: margin)
+    monkeypatch.setattr(Problem, "margins", lambda *_: margin)
     generator = torch.Generator().manual_seed(0)
     spec = PolicySpec(5, 2, True, ())
     population = Population.create(spec, len(margin), generator=generator)
     remember = Remember()
+    problem = Problem(spec, bank, comparisons)
     popl = POPL(
-        population, bank, comparisons, variation=remember, epsilon=epsilon, generator=generator
+        problem,
+        population=population,
+        variation=remember,
+        epsilon=epsilon,
+        generator=generator,
     )
     metrics = popl.step()
     assert popl.generation == 1
@@ -284,16 +291,12 @@ def test_two_hidden_groups_each_find_a_policy():
         env=EnvConfig(max_steps=60),
     )
     bank = SegmentBank.from_segments(data.steps)
-    method = MethodConfig(
-        members=16, generations=15, hidden=[32], batch_size=64, learning_rate=5e-3
-    )
-    popl = build_popl(
-        method,
-        PolicySpec.from_env(world.env, hidden=method.hidden),
-        bank,
-        Comparisons.from_preferences(data.preferences, cases="rater"),
-        generator=stream(0, "learner"),
-    )
+    recipe = Training(steps=225, batch_size=64, learning_rate=5e-3)
+    method = MethodConfig(members=16, generations=15, hidden=[32], training=recipe)
+    comparisons = Comparisons.from_preferences(data.preferences, cases="rater")
+    spec = PolicySpec.from_env(world.env, hidden=method.hidden)
+    problem = build_problem(method, spec, bank, comparisons)
+    popl = build_method(method, problem, num_groups=2, generator=stream(0, "learner"))
     for _ in range(method.generations):
         popl.step()
     draw = stream(0, "held-out pairs")

@@ -3,7 +3,9 @@ import math
 import pytest
 import torch
 
-from popl_rl.algorithms.refinement import RefinementSettings, predictive, refine, smallest_team
+from popl_rl.algorithms.problem import Problem
+from popl_rl.algorithms.refinement import predictive, refine, smallest_subset
+from popl_rl.config import RefinementSettings, Training
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.policies import PolicySpec
@@ -11,7 +13,8 @@ from popl_rl.models.population import Population
 from popl_rl.models.preference_likelihood import log_likelihood
 from popl_rl.models.scoring import segment_scores
 
-QUICK = RefinementSettings(steps=500, batch_size=32, learning_rate=0.02, mistake=0.0, most=4)
+QUICK = RefinementSettings(steps=500, most=4)
+RECIPE = Training(batch_size=32, learning_rate=0.02, slip=0.0)
 
 
 def of_cases(case):
@@ -51,21 +54,21 @@ def test_a_member_has_to_earn_its_place():
     noise = torch.randn(2, 80, generator=torch.Generator().manual_seed(0)) * 0.01
     first = torch.cat([torch.full((40,), -0.1), torch.full((40,), -3.0)])
     likelihood = torch.stack([first + noise[0], first + noise[1], first.flip(0)])
-    team = smallest_team(likelihood, of_cases([i // 4 for i in range(80)]))
+    team = smallest_subset(likelihood, of_cases([i // 4 for i in range(80)]))
     assert len(team) == 2
     assert 2 in team
 
 
 def test_one_that_serves_everybody_is_enough():
     likelihood = torch.tensor([[-1.0] * 8, [-0.5] * 8, [-2.0] * 8])
-    assert smallest_team(likelihood, of_cases([0, 0, 1, 1, 2, 2, 3, 3])) == [1]
+    assert smallest_subset(likelihood, of_cases([0, 0, 1, 1, 2, 2, 3, 3])) == [1]
 
 
 def test_no_more_than_asked_for():
     likelihood = torch.full((6, 6), -3.0).fill_diagonal_(-0.1).repeat_interleave(2, 1)
     comparisons = of_cases([i // 2 for i in range(12)])
-    assert len(smallest_team(likelihood, comparisons, most=3)) <= 3
-    assert len(smallest_team(likelihood, comparisons)) == 6
+    assert len(smallest_subset(likelihood, comparisons, most=3)) <= 3
+    assert len(smallest_subset(likelihood, comparisons)) == 6
 
 
 def two_tastes():
@@ -91,7 +94,8 @@ def two_tastes():
 def refined(seed=0):
     population, bank, comparisons = two_tastes()
     generator = torch.Generator().manual_seed(seed)
-    found = refine(population, bank, comparisons, alpha=0.5, settings=QUICK, generator=generator)
+    problem = Problem(population.spec, bank, comparisons, RECIPE)
+    found = refine(problem, population, settings=QUICK, generator=generator)
     return found, bank
 
 
@@ -106,7 +110,8 @@ def test_two_tastes_get_one_sharp_member_each():
 def test_the_population_is_left_as_it_was():
     population, bank, comparisons = two_tastes()
     before = population.members.data.clone()
-    refine(population, bank, comparisons, alpha=0.5, settings=QUICK, generator=torch.Generator())
+    problem = Problem(population.spec, bank, comparisons, RECIPE)
+    refine(problem, population, settings=QUICK, generator=torch.Generator())
     assert (before == population.members.data).all()
 
 

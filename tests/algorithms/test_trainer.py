@@ -1,4 +1,4 @@
-"""POPLTrainer with a stand-in for POPL that has the same kinds of state.
+"""MethodTrainer with a stand-in for POPL that has the same kinds of state.
 
 Run as a script with a folder, this file trains there while being killed again and again.
 """
@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from torchrl.checkpoint import Checkpoint
 
-from popl_rl.algorithms.trainer import POPLTrainer
+from popl_rl.algorithms.trainer import MethodTrainer
 from popl_rl.experiments.metrics import MetricsWriter
 
 GENERATIONS = 40
@@ -64,8 +64,8 @@ Log = list[tuple[int, dict[str, float]]]
 
 def make(
     folder: Path, popl: FakePOPL, log: Log, *, generations: int = 10, interval: int = 3
-) -> POPLTrainer:
-    return POPLTrainer(
+) -> MethodTrainer:
+    return MethodTrainer(
         popl,
         generations=generations,
         checkpoint_dir=folder,
@@ -108,7 +108,7 @@ def test_checkpoints_are_written_at_the_interval_and_at_the_end_and_two_are_kept
     tmp_path: Path,
 ) -> None:
     seen: list[list[int]] = []
-    trainer = POPLTrainer(
+    trainer = MethodTrainer(
         FakePOPL(),
         generations=10,
         checkpoint_dir=tmp_path,
@@ -218,14 +218,14 @@ def test_a_checkpoint_of_something_else_is_an_error(tmp_path: Path) -> None:
 def test_numbers_must_be_positive(tmp_path: Path, name: str) -> None:
     numbers = {"generations": 1, "checkpoint_interval": 1, name: 0}
     with pytest.raises(ValueError, match=f"{name} must be at least 1, got 0"):
-        POPLTrainer(FakePOPL(), checkpoint_dir=tmp_path, on_generation=lambda *_: None, **numbers)
+        MethodTrainer(FakePOPL(), checkpoint_dir=tmp_path, on_generation=lambda *_: None, **numbers)
 
 
 def train_in(folder: Path) -> FakePOPL:
     """As a training script does it: metrics to a file, and resuming whatever is there."""
     popl = FakePOPL()
     writer = MetricsWriter(folder / "metrics.csv")
-    trainer = POPLTrainer(
+    trainer = MethodTrainer(
         popl,
         generations=GENERATIONS,
         checkpoint_dir=folder / "checkpoint",

@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
+from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.vpl import VPL, AnswerEncoder, EncodedPolicySet, divergence, spread_points
-from popl_rl.config import MethodConfig
+from popl_rl.config import Training, VPLSettings
 from popl_rl.data.bank import SegmentBank
-from popl_rl.experiments.builders import build_popl, final_set
 from popl_rl.keys import ANSWER, PAIR, RATER
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet
@@ -20,10 +20,13 @@ CONTINUOUS = PolicySpec(3, 2, False, (6, 6))
 
 
 def build(bank, comparisons, *, seed=0, spec=SPEC, **settings):
-    settings = {"generations": 4, "steps": 3, "batch_size": 32, "latent": 3, **settings}
-    config = MethodConfig(algorithm="vpl", **settings)
+    own = {name: settings.pop(name) for name in ("kl", "latent") if name in settings}
+    generations = settings.pop("generations", 4)
+    steps = settings.pop("steps", 3) * generations
+    training = Training(steps=steps, **{"batch_size": 32, **settings})
+    problem = Problem(spec, bank, comparisons, training, generations=generations)
     generator = torch.Generator().manual_seed(seed)
-    return build_popl(config, spec, bank, comparisons, generator=generator)
+    return VPL(problem, vpl=VPLSettings(**{"latent": 3, **own}), generator=generator)
 
 
 def tensors(popl):
@@ -80,7 +83,9 @@ def test_what_z_adds_to_the_first_layer_is_a_bias(bank, comparisons, spec, gener
         conditioned = popl.scores(segment, z)
     policies = popl.policies_for(z)
     assert policies.spec == spec
-    ordinary = segment_scores(policies, bank, alpha=popl.alpha, discount=0.9)[:, :10]
+    ordinary = segment_scores(policies, bank, alpha=popl.problem.training.alpha, discount=0.9)[
+        :, :10
+    ]
     torch.testing.assert_close(ordinary, conditioned, rtol=1e-4, atol=1e-5)
     assert not torch.allclose(ordinary[0], ordinary[1])
 
@@ -135,7 +140,7 @@ def answers_of(preferences, rater):
 def test_two_obvious_groups_are_found_and_their_raters_catered_to(
     trained, segments, bank, comparisons, preferences
 ):
-    found = final_set(trained)
+    found = trained.result()
     assert isinstance(found, EncodedPolicySet)
     values = case_values(
         margins(found.population, bank, comparisons, alpha=found.alpha) > 0, comparisons
@@ -158,7 +163,7 @@ def test_the_nearest_in_units_of_the_belief(monkeypatch, trained, bank, preferen
 
     The weights are as exp(-9 / 2) to exp(-25 / 2).
     """
-    found = final_set(trained).subset([0, 1])
+    found = trained.result().subset([0, 1])
     found.z = torch.tensor([[0.0, 0.5], [3.0, 0.0]])
     belief = (torch.zeros(1, 2), torch.tensor([[1.0, 0.1]]).log())
     monkeypatch.setattr(found, "encoder", lambda *_: belief)
@@ -168,7 +173,7 @@ def test_the_nearest_in_units_of_the_belief(monkeypatch, trained, bank, preferen
 
 
 def test_catering_by_lexicase_is_that_of_any_set(trained, bank, preferences):
-    found = final_set(trained)
+    found = trained.result()
     plain = PolicySet(found.population, alpha=found.alpha)
     said = answers_of(preferences, 2)
     one, other = (
@@ -182,7 +187,7 @@ def test_catering_by_lexicase_is_that_of_any_set(trained, bank, preferences):
 
 def test_the_set_is_bounded_and_part_of_it_can_be_taken(monkeypatch, trained, bank, preferences):
     monkeypatch.setattr("popl_rl.algorithms.vpl._MOST", 5)
-    found = final_set(trained)
+    found = trained.result()
     assert len(found) == len(found.z) == len(trained.population) == 5
     part = found.subset([4, 2])
     assert isinstance(part, EncodedPolicySet)
@@ -194,7 +199,7 @@ def test_the_set_is_bounded_and_part_of_it_can_be_taken(monkeypatch, trained, ba
 def test_what_is_saved_is_a_plain_set_that_caters_by_the_answers(
     trained, tmp_path, bank, preferences, comparisons
 ):
-    found = final_set(trained)
+    found = trained.result()
     found.save(tmp_path / "policies")
     loaded = PolicySet.load(tmp_path / "policies")
     assert type(loaded) is PolicySet
@@ -225,7 +230,7 @@ def test_looking_at_the_population_changes_nothing(bank, comparisons):
     one.step()
     other.step()
     assert len(one.population) == 8
-    one.policies()
+    one.result()
     assert one.step() == other.step()
 
 
@@ -242,9 +247,9 @@ def test_continuing_is_as_never_having_stopped(bank, comparisons):
 
 
 def test_what_it_cannot_do_is_said(bank, comparisons):
-    with pytest.raises(ValueError, match=r"method\.algorithm=vpl learns policies, not reward"):
+    with pytest.raises(ValueError, match=r"method vpl learns policies, not reward"):
         build(bank, comparisons, spec=RewardSpec(5, 2, (6,)))
     with pytest.raises(ValueError, match="latent must be at least 1, got 0"):
-        VPL(SPEC, bank, comparisons, latent=0, generator=torch.Generator())
+        build(bank, comparisons, latent=0)
     with pytest.raises(ValueError, match=r"kl must be at least 0, got -1"):
-        VPL(SPEC, bank, comparisons, kl=-1, generator=torch.Generator())
+        build(bank, comparisons, kl=-1)

@@ -1,5 +1,6 @@
+"""Metaworld's tasks as environments, their raters, pictures and configurations."""
+
 import re
-from itertools import pairwise
 
 import mujoco
 import numpy as np
@@ -7,12 +8,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from popl_rl.data.rollouts import lockstep
-from popl_rl.data.segments import collect_segments
-from popl_rl.envs import _metaworld_data as data
-from popl_rl.envs._metaworld_data import check_scripted, collect_continuations
 from popl_rl.envs._metaworld_scripts import Scripted
-from popl_rl.envs._metaworld_simulator import task_name
+from popl_rl.envs._metaworld_simulator import simulator, task_name
 from popl_rl.envs.metaworld_tasks import (
     STEP_SECONDS,
     MetaworldTask,
@@ -21,9 +18,7 @@ from popl_rl.envs.metaworld_tasks import (
     gentle,
     metaworld,
 )
-from popl_rl.models.policy_set import PolicySet
 from popl_rl.plotting.animation import record_gif
-from popl_rl.trainers.train_popl import run
 
 TASKS = ["drawer-open", "door-open", "button-press", "plate-slide", "sweep-into", "bin-picking"]
 
@@ -129,7 +124,7 @@ def test_speeds_are_displacements_over_time():
     remaining = [info["remaining"], *(step[4]["remaining"] for step in steps)]
     closed = [step[4]["closed"] for step in steps]
     assert np.allclose(closed, -np.diff(remaining), atol=1e-6)
-    simulated = env.unwrapped._shared.env
+    simulated = simulator(env.unwrapped.task).env
     assert simulated.model.opt.timestep * simulated.frame_skip == pytest.approx(STEP_SECONDS)
 
 
@@ -153,7 +148,7 @@ def test_episodes_end_when_done_or_out_of_time():
 def test_steps_go_on_beyond_metaworlds_horizon():
     env = metaworld(max_steps=1000)
     env.reset(seed=0)
-    env.unwrapped._shared.env.curr_path_length = 499
+    simulator(env.unwrapped.task).env.curr_path_length = 499
     assert [step[3] for step in play(env, draw_actions(3))] == [False] * 3
 
 
@@ -169,68 +164,6 @@ def test_mistakes_of_use_are_told():
     for wrong in (np.zeros(3, np.float32), np.full(4, np.nan, np.float32)):
         with pytest.raises(ValueError, match="4 finite numbers"):
             env.step(wrong)
-
-
-def test_a_script_keeps_to_its_speed():
-    env = metaworld()
-    step = TensorDict({"observation": torch.from_numpy(env.reset(seed=0)[0])[None]}, [1])
-    generator = torch.Generator().manual_seed(0)
-    quick, slow = Scripted("drawer-open"), Scripted("drawer-open", speed=0.2)
-    assert slow(step, generator)[0, :3].abs().max() == 0.25  # 0.2 of 0.8 m/s
-    assert torch.equal(
-        slow(step, generator)[:, :3], quick(step, generator)[:, :3].clamp(-0.25, 0.25)
-    )
-    noisy = Scripted("drawer-open", speed=0.2, noise=0.1)
-    drawn = torch.cat([noisy(step, generator)[:, :3] for _ in range(200)])
-    assert drawn.std(0).mean() == pytest.approx(0.025, rel=0.2)
-
-
-def test_pushes_last_ten_steps():
-    env = metaworld()
-    step = TensorDict({"observation": torch.from_numpy(env.reset(seed=0)[0])[None]}, [1])
-    pushed = Scripted("drawer-open", push=1.0)
-    generator = torch.Generator().manual_seed(0)
-    moves = [pushed(step, generator)[0, :3] for _ in range(40)]
-    changes = [i for i, (a, b) in enumerate(pairwise(moves), 1) if not torch.equal(a, b)]
-    assert changes == [10, 11, 21, 22, 32, 33]  # the script has a step between two pushes
-    pushed.reset()
-    assert len(pushed._left) == 0
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [({"speed": 0}, "speed"), ({"noise": -1}, "noise"), ({"push": 2}, "push")],
-)
-def test_scripts_check_their_arguments(arguments, message):
-    with pytest.raises(ValueError, match=f"{message} must be"):
-        Scripted("drawer-open", **arguments)
-
-
-def test_the_door_opens_at_half_speed():
-    """Metaworld's own script does not."""
-    slow, generator = Scripted("door-open", speed=0.4), torch.Generator()
-    act = lambda step: slow(step, generator)  # noqa: E731
-    episodes = lockstep([metaworld("door-open")], act, seeds=[0], max_steps=250)
-    assert episodes["info", "success"].any()
-    assert episodes["info", "hand_speed"].max() < 0.8
-
-
-def test_behaviours_give_segments():
-    env = metaworld("plate-slide").unwrapped
-    behaviours = env.behaviours()
-    assert {name.split("/")[0] for name in behaviours} == {"scripted", "rough"}
-    chosen = {name: behaviours[name] for name in ("scripted/0.25", "rough/0.8")}
-    segments = collect_segments(
-        lambda: metaworld("plate-slide"),
-        chosen,
-        num_segments=6,
-        length=10,
-        max_steps=20,
-        num_envs=2,
-        generator=torch.Generator().manual_seed(0),
-    )
-    assert segments.batch_size == (6, 10)
-    assert segments["action"].abs().max() <= 1
 
 
 def made_up(**info):
@@ -255,38 +188,6 @@ def test_utilities_by_hand():
     assert brisk_but_careful(segments)[0].tolist() == pytest.approx(
         [0.025 - 0.0125, -0.0125 - 0.0125, 0, -0.0125 / 4, -0.00125]
     )
-
-
-def test_continuations_begin_alike():
-    env = MetaworldTask("button-press")
-    generator = torch.Generator().manual_seed(0)
-    counts = []
-    segments = collect_continuations(
-        env, starts=3, per_start=2, length=12, generator=generator, progress=counts.append
-    )
-    assert segments.batch_size == (6, 12)
-    assert segments["info", "start"][:, 0].tolist() == [0, 0, 1, 1, 2, 2]
-    first = segments["observation"][:, 0]
-    assert torch.equal(first[0::2], first[1::2])
-    assert not torch.equal(first[0], first[2])
-    assert not torch.equal(segments["action"][0], segments["action"][1])
-    assert counts == [2, 4, 6]
-    with pytest.raises(ValueError, match="per_start must be 1 to 4"):
-        collect_continuations(env, starts=1, per_start=9, generator=generator)
-    with pytest.raises(ValueError, match="length must be at least 1"):
-        collect_continuations(env, starts=1, length=0, generator=generator)
-
-
-def test_a_task_that_scripts_fail_is_refused():
-    message = r"'drawer-open-v3'.*within 5 steps \(scripted/0.25 0%.*of 1 episodes, at least 50%"
-    with pytest.raises(ValueError, match=message):
-        check_scripted(MetaworldTask(max_steps=5), episodes=1)
-
-
-def test_rates_of_scripts(monkeypatch):
-    quick = {"scripted/0.8": Scripted("plate-slide")}
-    monkeypatch.setattr(MetaworldTask, "behaviours", lambda _: quick)
-    assert data.check_scripted(MetaworldTask("plate-slide"), episodes=2) == {"scripted/0.8": 1.0}
 
 
 def test_a_missing_renderer_gets_a_hint(monkeypatch):
@@ -339,64 +240,3 @@ def test_a_configuration_of_any_task(config_of):
     )
     assert config.env.options.task == "window-close"
     assert len(config.raters.groups) == 3
-
-
-def test_a_number_of_segments_that_is_no_multiple_of_the_speeds_is_refused():
-    generator = torch.Generator().manual_seed(0)
-    with pytest.raises(ValueError, match=r"multiple of the scripted speeds.*got 30 segments and 4"):
-        MetaworldTask().collect_segments(30, 8, generator=generator)
-    with pytest.raises(ValueError, match="got 4 segments and 1 speeds"):
-        MetaworldTask(speeds=[0.5]).collect_segments(4, 8, generator=generator)
-
-
-def test_a_run_from_segments_to_animations(config_of, tmp_path, monkeypatch):
-    """One tiny run: style codes, one set of segments for two runs, motion and its pictures."""
-    picture = np.zeros((8, 8, 3), np.uint8)
-    monkeypatch.setattr(MetaworldTask, "render", lambda env: picture + np.uint8(env._time % 250))
-    monkeypatch.setattr(data, "check_scripted", lambda *_, **__: {})
-    overrides = (
-        "env=metaworld/button_press",
-        "env.max_steps=90",
-        f"data.store={tmp_path / 'store'}",
-        "data.segments=24",
-        "data.length=20",
-        "raters.count=8",
-        "raters.answers=5",
-        "method.hidden=[16,16]",
-        "method.clone_steps=60",
-        "method.members=4",
-        "method.generations=2",
-        "method.steps=2",
-        "method.pooled_steps=3",
-        "method.specialist_steps=2",
-        "evaluation.episodes=2",
-        "evaluation.new_raters=2",
-        "evaluation.answers=5",
-        "evaluation.baseline_steps=10",
-        "logger=csv",
-    )
-    result = run(config_of(*overrides, f"run_dir={tmp_path / 'run'}"))
-    table = result.board.results
-    assert {"fast", "gentle"} <= set(table.group)
-    assert {"popl", "cpl", "oracle", "clone", "random"} <= set(table.method)
-    assert table[table.measure == "return"].value.notna().all()
-    speeds = table[table.measure.isin(["mean_hand_speed", "peak_hand_speed"])]
-    assert len(speeds) >= 20
-    assert (speeds.value > 0).all()
-    # A recovery of 0 is what the oracle of the other group is worth.
-    for group in ("fast", "gentle"):
-        value, best = (result.board.value(who, group, "return") for who in ("clone", "oracle"))
-        recovered = result.board.value("clone", group, "recovery")
-        assert np.isnan(recovered) or (recovered < 1) == (value < best)
-    drawn = {path.name for path in (tmp_path / "run" / "figures").iterdir()}
-    assert {"plane.png", "profiles.png", "fast.gif", "gentle.gif"} <= drawn
-    loaded = PolicySet.load(tmp_path / "run" / "policies")
-    seen = torch.rand(3, 39, generator=torch.Generator().manual_seed(0))
-    assert torch.allclose(loaded.act(seen), result.policies.act(seen), atol=1e-4)
-
-    (store,) = (tmp_path / "store").glob("metaworld-button-press-*")
-    kept = [path for path in store.rglob("*") if path.is_file() and path.suffix != ".lock"]
-    before = {path: path.stat().st_mtime_ns for path in kept}
-    again = run(config_of(*overrides, f"run_dir={tmp_path / 'again'}"))
-    assert again.board.results.equals(table)
-    assert {path: path.stat().st_mtime_ns for path in kept} == before

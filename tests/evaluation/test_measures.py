@@ -62,6 +62,19 @@ def test_returns_by_hand(episodes):
     assert group_returns(episodes, groups).tolist() == [[18.0, 0.5]]
 
 
+def logarithmic(segments):
+    """Undefined where a reward is not positive, as after an episode's end."""
+    return segments["reward"].log()
+
+
+def test_groups_are_not_shown_what_stands_after_an_end(episodes):
+    episodes["reward"][0, 1, 2] = 0.0
+    groups = (RaterGroup("log", logarithmic, Response()),)
+    expected = (math.log(1 * 2 * 3) + math.log(10 * 20)) / 2
+    assert group_returns(episodes, groups).item() == pytest.approx(expected)
+    assert episodes["reward"][0, 1].tolist() == [10.0, 20.0, 0.0]
+
+
 def test_rates_by_hand(episodes):
     """No door and door 1 in both episodes; door 0 in the first, and after the second's end."""
     rates = info_rates(episodes, "door")

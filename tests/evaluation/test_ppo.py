@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 import torch
 
-from popl_rl.evaluation import ppo
 from popl_rl.evaluation.ppo import reward_of, train_ppo
+from popl_rl.evaluation.ppo_episodes import Ending, roll_episodes, running_returns
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.population import Population
@@ -190,9 +190,9 @@ def test_a_constant_decides_whether_an_episode_should_end(gain, leaves):
 
 @pytest.mark.parametrize(("terminates", "steps"), [(True, 3), (False, 3), (True, 9)])
 def test_how_episodes_end(terminates, steps):
-    envs = [ppo._Ending(Stairs(steps, terminates=terminates)) for _ in range(2)]
+    envs = [Ending(Stairs(steps, terminates=terminates)) for _ in range(2)]
     zero = torch.zeros(2, dtype=torch.long)
-    rolled = ppo._roll(envs, lambda _: zero, max_steps=5, generator=seeded(0))
+    rolled = roll_episodes(envs, lambda _: zero, max_steps=5, generator=seeded(0))
     length = min(steps, 5)
     count = torch.arange(length).repeat(2).unsqueeze(-1)
     last = count == length - 1
@@ -205,7 +205,7 @@ def test_how_episodes_end(terminates, steps):
 def test_running_returns_start_anew_with_each_episode():
     gain = torch.tensor([1.0, 2.0, 4.0, 8.0])
     done = torch.tensor([False, True, False, True])
-    returns = ppo._running_returns(gain, done, 0.5)
+    returns = running_returns(gain, done, 0.5)
     assert returns.squeeze(-1).tolist() == [1.0, 2.5, 4.0, 10.0]
 
 

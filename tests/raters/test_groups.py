@@ -248,6 +248,37 @@ def test_what_a_rater_returns_is_checked(segments, function, error, message):
     assert "rater 'broken'" in str(caught.value)
 
 
+def test_a_rater_may_return_float64(segments, table):
+    """Everything comes out as if it had returned float32."""
+    precise = lambda steps: by_reward(steps).double()  # noqa: E731
+    for label in ("return", "regret"):
+        one, other = (
+            make_groups([utility], label=label, table=table)[0] for utility in (by_reward, precise)
+        )
+        for name in ("step_utility", "perceived_utility", "segment_utility"):
+            found = [getattr(group, name)(segments) for group in (one, other)]
+            assert torch.equal(*found)
+            assert found[0].dtype == found[1].dtype
+
+
+def test_numbers_too_large_for_float32_are_refused(segments):
+    group = RaterGroup("large", lambda steps: by_reward(steps).double() + 1e300, Response())
+    with pytest.raises(ValueError, match="9 NaN or infinite of 9, as float32"):
+        group.step_utility(segments)
+
+
+def test_regret_where_actions_do_not_begin_with_0(segments, table):
+    steps = table.steps.clone()
+    steps["action"] += 3
+    shifted = Table(steps, table.next_state, table.terminal, table.start)
+    later = segments.clone()
+    later["action"] += 3
+    one, other = (make_groups([by_reward], table=each)[0] for each in (table, shifted))
+    assert torch.equal(one.perceived_utility(segments), other.perceived_utility(later))
+    with pytest.raises(ValueError, match=r"knows 2 states and 2 actions, got .* number -3"):
+        other.perceived_utility(segments)
+
+
 def test_what_a_rater_raises_is_the_cause(segments):
     group = RaterGroup("broken", lambda s: s["speed"], Response())
     with pytest.raises(ValueError, match="broken") as caught:

@@ -14,9 +14,11 @@ from hypothesis import strategies as st
 from scipy.stats import chi2_contingency, chisquare
 from torch import Tensor
 
-from popl_rl.selection import lexicase as module
+from popl_rl.selection import behaviours
 from popl_rl.selection.lexicase import SelectionReport, lexicase_report, lexicase_selection
-from popl_rl.selection.pools import PassPools, Round, median_absolute_deviation
+from popl_rl.selection.mad import median_absolute_deviation
+from popl_rl.selection.pools import PassPools, ScorePools
+from popl_rl.selection.rounds import Round
 
 DRAWS = 3000
 
@@ -70,10 +72,10 @@ def assert_distribution(
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Run on each way through the engine: they differ in speed and must not in outcome."""
     if request.param == "settled":
-        monkeypatch.setattr(Round, "_settling_work", lambda *_: 0.0)
+        monkeypatch.setattr(Round, "settling_work", lambda *_: 0.0)
         monkeypatch.setattr(PassPools, "block", property(lambda _: 1, lambda *_: None), False)
     if request.param == "chunked":
-        for pools in (PassPools, module.ScorePools):
+        for pools in (PassPools, ScorePools):
             monkeypatch.setattr(pools, "chunk", property(lambda _: 97, lambda *_: None), False)
     return str(request.param)
 
@@ -352,78 +354,10 @@ def test_infinite_scores_and_both_zeros_are_ordered():
 
 
 def test_clashing_fingerprints_do_no_harm(monkeypatch):
-    monkeypatch.setattr(module, "_fingerprints", lambda scores: scores.new_zeros(len(scores)))
+    monkeypatch.setattr(behaviours, "fingerprints", lambda scores: scores.new_zeros(len(scores)))
     report = lexicase_report(PASSES, DRAWS, generator=generator())
     assert report.distinct == 5
     assert_distribution(report, PASSES, [0.0] * 5)
-
-
-@settings(max_examples=50, deadline=None)
-@given(
-    members=st.integers(2, 30), cases=st.integers(1, 700), flips=st.integers(0, 6), data=st.data()
-)
-def test_rows_are_one_behaviour_exactly_if_they_are_equal(members, cases, flips, data):
-    seed = data.draw(st.integers(0, 99))
-    scores = torch.zeros(members, cases, dtype=torch.bool)
-    for _ in range(flips):
-        member = data.draw(st.integers(0, members - 1))
-        scores[member, data.draw(st.integers(0, cases - 1))] ^= True
-    report = lexicase_report(scores, 1, generator=generator(seed))
-    assert report.distinct == len(scores.unique(dim=0))
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"scores": [[1.0]]}, TypeError, r"scores must be a torch.Tensor, got list"),
-        (
-            {"scores": torch.ones(2, 2, dtype=torch.complex64)},
-            TypeError,
-            "scores must be bool, int",
-        ),
-        ({"scores": torch.ones(3)}, ValueError, r"\[member, case\] matrix, got shape \(3,\)"),
-        ({"scores": torch.ones(0, 3)}, ValueError, r"at least one member .* shape \(0, 3\)"),
-        ({"scores": torch.ones(3, 0)}, ValueError, r"and one case, got shape \(3, 0\)"),
-        (
-            {"scores": torch.tensor([[1.0, torch.nan], [torch.nan, torch.inf]])},
-            ValueError,
-            "scores must not contain NaN, got 2 of them",
-        ),
-        ({"num_selected": 0}, ValueError, "num_selected must be at least 1, got 0"),
-        ({"num_selected": 2.0}, TypeError, "num_selected must be an int, got float"),
-        ({"num_selected": True}, TypeError, "num_selected must be an int, got bool"),
-        ({"epsilon": -0.1}, ValueError, "epsilon must be finite and at least 0, got -0.1"),
-        ({"epsilon": math.nan}, ValueError, "epsilon must be finite and at least 0, got nan"),
-        ({"epsilon": math.inf}, ValueError, "epsilon must be finite and at least 0"),
-        ({"epsilon": torch.tensor([0.1, -1.0, 0.0])}, ValueError, "at least 0, got -1.0 to 0.1"),
-        ({"epsilon": torch.ones(2)}, ValueError, r"shape \(3,\), got shape \(2,\)"),
-        ({"epsilon": "median"}, ValueError, "'mad' or None, got 'median'"),
-        ({"epsilon": [0.1, 0.1, 0.1]}, TypeError, "epsilon must be .* got list"),
-        ({"epsilon": True}, TypeError, "epsilon must be .* got bool"),
-        ({"epsilon": 0.1, "epsilon_mode": "full"}, ValueError, "got 'full'; use 'semi-dynamic'"),
-        (
-            {"scores": torch.full((2, 3), -torch.inf), "epsilon": "mad"},
-            ValueError,
-            "scores must be finite if epsilon is 'mad'",
-        ),
-        ({"cases_per_selection": 4}, ValueError, "from 1 to 3, the number of cases, got 4"),
-        ({"cases_per_selection": 0}, ValueError, "cases_per_selection must be from 1 to 3"),
-        ({"cases_per_selection": 1.5}, TypeError, "cases_per_selection must be an int, got float"),
-        ({"generator": 7}, TypeError, r"torch.Generator, got int; make one with"),
-        (
-            {"scores": torch.ones(2, 3, device="meta")},
-            ValueError,
-            "on the device of scores, meta, got cpu",
-        ),
-    ],
-)
-def test_mistakes_are_explained(change, error, message):
-    scores = torch.rand(4, 3, generator=generator())
-    arguments = {"scores": scores, "num_selected": 5, "generator": generator()} | change
-    if isinstance(scores := arguments["scores"], Tensor) and scores.is_meta:
-        arguments["scores"] = scores.int()  # has no values to check first
-    with pytest.raises(error, match=message):
-        lexicase_selection(**arguments)
 
 
 @pytest.mark.gpu
@@ -446,10 +380,3 @@ def test_selection_on_cuda_follows_the_enumerated_orders(way, scores, epsilon, l
     assert report.parents.is_cuda
     assert report.depth.is_cuda
     assert_distribution(report, scores, tolerance, limit)
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
-def test_generator_and_scores_must_be_on_one_device():
-    with pytest.raises(ValueError, match="generator must be on the device of scores"):
-        lexicase_selection(PASSES.cuda(), 5, generator=generator())

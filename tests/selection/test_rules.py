@@ -4,18 +4,21 @@ import pytest
 import torch
 from scipy.stats import chisquare
 
-from popl_rl.config import _SELECTIONS, MethodConfig
-from popl_rl.experiments.builders import build_popl
+from popl_rl.algorithms.assembly import build_popl
+from popl_rl.algorithms.problem import Problem
+from popl_rl.config import MixtureSettings, POPLSettings, Training
+from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.scoring import case_values, margins
 from popl_rl.selection import rules as selection
 from popl_rl.selection.rules import (
     SELECTIONS,
     best_sum_selection,
+    fronts_and_crowding,
     nsga2_selection,
     random_selection,
     report,
-    selection_of,
+    selection_rule,
     tournament_selection,
 )
 
@@ -75,7 +78,7 @@ def test_fronts_and_crowding_on_paper():
     In the first front 0 and 2 are at the ends. On each case the neighbours of member 1 are these
     two, as far apart as the front is wide; pymoo takes the mean over the cases, (1 + 1) / 2.
     """
-    front, crowding = selection._fronts(VALUES)
+    front, crowding = fronts_and_crowding(VALUES)
     assert front.tolist() == [0, 0, 0, 1]
     assert crowding[:3].tolist() == [torch.inf, 1.0, torch.inf]
 
@@ -95,8 +98,8 @@ def test_without_pymoo_nsga2_says_what_to_install(monkeypatch, generator):
     with pytest.raises(ValueError, match=message):
         nsga2_selection(VALUES, 2, generator=generator)
     with pytest.raises(ValueError, match=message):
-        selection_of("nsga2")
-    assert selection_of("tournament") is not None, "others do without it"
+        selection_rule("nsga2")
+    assert selection_rule("tournament") is not None, "others do without it"
 
 
 def test_every_rule_gives_parents_and_the_seed_decides(rule):
@@ -131,16 +134,15 @@ def test_sizes_are_checked(generator):
         best_sum_selection(VALUES, 2, share=0, generator=generator)
 
 
-def test_rules_have_the_names_of_the_configuration():
-    assert ("lexicase", *SELECTIONS) == _SELECTIONS
-    assert selection_of("lexicase") is None
-    assert selection_of("best_sum") is best_sum_selection
+def test_rules_are_found_by_name():
+    assert selection_rule("lexicase") is None
+    assert selection_rule("best_sum") is best_sum_selection
     with pytest.raises(ValueError, match=r"selection must be one of lexicase, .*got 'roulette'"):
-        selection_of("roulette")
+        selection_rule("roulette")
 
 
 def test_the_size_of_tournaments_is_passed_on(generator):
-    everybody = selection_of("tournament", tournament=4)
+    everybody = selection_rule("tournament", tournament=4)
     assert everybody(VALUES, 5, generator=generator).tolist() == [1] * 5
 
 
@@ -157,11 +159,17 @@ def test_a_report_by_hand():
 # Within POPL
 
 
+def each_alone(comparisons):
+    """The same comparisons, each a case of its own."""
+    count = len(comparisons)
+    return Comparisons(comparisons.preferred, comparisons.other, torch.arange(count), count)
+
+
 def build(bank, comparisons, **settings):
-    config = MethodConfig(
-        members=6, generations=4, hidden=[6], batch_size=8, steps=2, pooled_steps=3, **settings
-    )
-    return build_popl(config, PolicySpec(5, 2, True, (6,)), bank, comparisons, generator=seeded())
+    spec, training = PolicySpec(5, 2, True, (6,)), Training(steps=8, batch_size=8)
+    problem = Problem(spec, bank, comparisons, training, members=6, generations=4)
+    popl = POPLSettings(pooled_steps=3, **settings)
+    return build_popl(problem, popl=popl, generator=seeded())
 
 
 def spied(popl, monkeypatch):
@@ -216,23 +224,35 @@ def test_popl_continues_to_the_bit(bank, comparisons, name):
     assert [resumed.step() for _ in range(2)] == expected
 
 
-def test_teams_are_selected_by_the_rule_too(monkeypatch, bank, comparisons):
-    config = MethodConfig(cases="preference", teams=5, team_generations=24, selection="best_sum")
-    popl = build_popl(config, PolicySpec(5, 2, True, (6,)), bank, comparisons, generator=seeded())
-    sums = []
+def test_mixtures_are_selected_by_the_rule_too(bank, comparisons):
+    single = each_alone(comparisons)
+    problem = Problem(PolicySpec(5, 2, True, (6,)), bank, single, Training(batch_size=8))
+    mixture = MixtureSettings(mixtures=5, steps=2, bundle=5, first_selection=1)
+    popl = build_popl(
+        problem, popl=POPLSettings(selection="best_sum"), mixture=mixture, generator=seeded()
+    )
+    assert popl.select is best_sum_selection
+    seen = []
 
     def rule(values, count, *, generator):
-        sums.append(values.sum(1))
-        return best_sum_selection(values, count, generator=generator)
+        seen.append(best_sum_selection(values, count, generator=generator))
+        return seen[-1]
 
-    assert popl.select is best_sum_selection
     popl.select = rule
-    popl.generation = popl.settings.first_selection
-    chosen = []
-    monkeypatch.setattr(popl, "_replace", chosen.append)
-    monkeypatch.setattr(popl, "_draw", lambda _source: torch.arange(8))
     metrics = popl.step()
-    best = set(sums[0].argsort(descending=True)[:2].tolist())
-    assert set(chosen[0].tolist()) <= best
+    assert seen[0].shape == (5,)
     assert metrics["selection_depth"] == 0
     assert metrics["effective_parents"] <= 2
+
+
+def test_a_rule_of_ones_own_is_found_by_reference(tmp_path, bank, comparisons):
+    """One function, in a file of its own."""
+    (tmp_path / "mine.py").write_text(
+        "import torch\n"
+        "def first(values, count, *, generator):\n"
+        "    return torch.zeros(count, dtype=torch.long)\n"
+    )
+    popl = build(bank, comparisons, selection=f"{tmp_path}/mine.py:first")
+    assert popl.step()["effective_parents"] == 1.0
+    with pytest.raises(ValueError, match="unknown selection 'lexicas'"):
+        build(bank, comparisons, selection="lexicas")

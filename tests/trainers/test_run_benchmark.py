@@ -425,7 +425,7 @@ def test_a_real_benchmark_in_a_worker_process(tiny, capfd):
 def test_a_launcher_takes_cells_to_other_processes(call, tiny):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     overrides = OmegaConf.to_yaml({"overrides": [one for one in tiny if one != "logger=csv"]})
-    methods = "methods: {popl: [], other: [method.steps=3]}\nscenarios: {plain: []}\n"
+    methods = "methods: {popl: [], other: [method.training.steps=3]}\nscenarios: {plain: []}\n"
     Path("mine.yaml").write_text(overrides + methods)
     launcher = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
     code, text = call("-m", "suite=mine.yaml", "seeds=1", "run_dir=out", "cell=0,1", *launcher)

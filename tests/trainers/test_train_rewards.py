@@ -19,13 +19,12 @@ STATELESS = [
     "raters.answers=10",
     "method.members=4",
     "method.generations=3",
-    "method.steps=3",
+    "method.training.steps=200",
     "method.hidden=[8]",
     "evaluation.episodes=100",
     "evaluation.new_raters=2",
     "evaluation.curve=[1,5]",
     "evaluation.pairs=200",
-    "evaluation.baseline_steps=200",
     "evaluation.brex_steps=100",
     "evaluation.dpl_steps=20",
     "logger=csv",
@@ -118,11 +117,13 @@ def test_a_finished_run_is_judged_again(result, config_of, tmp_path):
 def test_other_ways_of_learning_them(train, overrides):
     result = train(*overrides)
     assert result.policies.population.evolve == "head"
-    assert math.isfinite(result.board.value("popl", "zeroed", "recovery"))
+    assert math.isfinite(result.board.value(result.board.label, "zeroed", "recovery"))
 
 
 def test_features_trained_on_everybody(train):
-    result = train("method.evolve=head", "method.features=pooled", "method.pooled_steps=20")
+    result = train(
+        "method.evolve=head", "method.popl.features=pooled", "method.popl.pooled_steps=20"
+    )
     plain = train("method.evolve=head")
     trunks = [r.policies.population.trunk.state_dict()["0.weight"] for r in (result, plain)]
     assert not torch.equal(*trunks)

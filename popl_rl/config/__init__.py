@@ -1,0 +1,48 @@
+"""Settings, with their defaults and what they mean. Imports neither torch nor TorchRL.
+
+``data``: environment, raters and segments; ``method``: methods, a section for each part;
+``evaluation``: how the result is evaluated; ``run``: a whole run; ``checks``: how they check
+themselves; ``unread``: settings that the chosen method does not read.
+"""
+
+from popl_rl.config.checks import Checker, parse_epsilon
+from popl_rl.config.data import DataConfig, EnvConfig, RatersConfig, ResponseConfig
+from popl_rl.config.evaluation import EvaluationConfig
+from popl_rl.config.method import (
+    SECTIONS,
+    CloneSettings,
+    EMSettings,
+    MethodConfig,
+    MixtureSettings,
+    POPLSettings,
+    RefinementSettings,
+    Training,
+    VPLSettings,
+)
+from popl_rl.config.run import Config, EvaluateConfig, LoggerConfig, plain, validate
+from popl_rl.config.unread import unread
+
+__all__ = [
+    "SECTIONS",
+    "Checker",
+    "CloneSettings",
+    "Config",
+    "DataConfig",
+    "EMSettings",
+    "EnvConfig",
+    "EvaluateConfig",
+    "EvaluationConfig",
+    "LoggerConfig",
+    "MethodConfig",
+    "MixtureSettings",
+    "POPLSettings",
+    "RatersConfig",
+    "RefinementSettings",
+    "ResponseConfig",
+    "Training",
+    "VPLSettings",
+    "parse_epsilon",
+    "plain",
+    "unread",
+    "validate",
+]

@@ -1,0 +1,103 @@
+"""Settings of where data come from: the environment, the raters, the segments."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from popl_rl.config.checks import Checker
+
+__all__ = ["DataConfig", "EnvConfig", "RatersConfig", "ResponseConfig"]
+
+
+@dataclass
+class EnvConfig:
+    """Which environment, and how long an episode may be."""
+
+    factory: str = "two_doors"  # registered name, module:attr or file.py:attr
+    options: dict[str, Any] = field(default_factory=dict)  # arguments of the factory
+    data_options: dict[str, Any] = field(default_factory=dict)  # on top of these, for data only
+    mixture: dict[str, float] | None = None  # share of behaviours in the data, by name or pattern
+    id: str | None = None  # id of a Gymnasium environment, for env=gym
+    max_steps: int = 60  # steps after which an episode is cut
+    success: str = "goal"  # number in info that is positive when the task is done
+    door: str | None = None  # integer in info whose values are worth a row in the table
+    measured: list[str] = field(default_factory=list)  # numbers in info whose mean and peak are
+
+    def check(self, at: Checker) -> None:
+        """Report values that are out of range."""
+        at.at_least_one(self, "max_steps")
+        reference = "a reference, such as env.factory=my_env.py:make"
+        at.expect(bool(self.factory), "factory", reference, self.factory)
+        if self.factory == "gymnasium:make":
+            name = "the id of a Gymnasium environment, such as env.id=CartPole-v1"
+            at.expect(bool(self.id), "id", name, self.id)
+        if self.mixture is not None:
+            proper = all(share >= 0 for share in self.mixture.values())
+            proper = proper and abs(sum(self.mixture.values()) - 1) < 1e-6
+            expected = "non-negative shares that sum to 1"
+            at.expect(proper, "mixture", expected, dict(self.mixture))
+
+
+@dataclass
+class ResponseConfig:
+    """How raters answer: B-Pref's model (Lee et al., 2021), the same for all groups."""
+
+    rationality: float = float("inf")  # beta of the Bernoulli answer; inf always tells the truth
+    mistake: float = 0.0  # chance that an answer is flipped
+    myopia: float = 1.0  # gamma; below 1 the end of a segment weighs more
+    tie: float = 0.0  # differences up to this are ties
+    skip: float | None = None  # pairs in which both are worth no more than this are skipped
+
+    def check(self, at: Checker) -> None:
+        """Report values that are out of range."""
+        at.positive(self, "rationality")
+        at.expect(0 <= self.mistake <= 1, "mistake", "in [0, 1]", self.mistake)
+        at.share(self, "myopia")
+        at.not_negative(self, "tie")
+
+
+@dataclass
+class RatersConfig:
+    """Who is asked, and what they want."""
+
+    groups: list[str] = field(default_factory=list)  # references of rater functions
+    shares: list[float] | None = None  # chance of each group; equal if null
+    count: int = 200  # raters
+    answers: int = 20  # answers of each
+    label: str = "regret"  # what raters compare by: regret or return
+    response: ResponseConfig = field(default_factory=ResponseConfig)
+
+    def check(self, at: Checker) -> None:
+        """Report values that are out of range."""
+        at.at_least_one(self, "count", "answers")
+        at.expect(bool(self.groups), "groups", "one or more rater references", self.groups)
+        repeated = len(set(self.groups)) < len(self.groups)
+        at.expect(not repeated, "groups", "different groups", self.groups)
+        if self.shares is not None:
+            expected = f"one number per group ({len(self.groups)})"
+            at.expect(len(self.shares) == len(self.groups), "shares", expected, self.shares)
+            proper = all(share >= 0 for share in self.shares) and abs(sum(self.shares) - 1) < 1e-6
+            at.expect(proper, "shares", "non-negative and sum to 1", self.shares)
+        at.expect(self.label in ("regret", "return"), "label", "regret or return", self.label)
+        self.response.check(at.below("response"))
+
+
+@dataclass
+class DataConfig:
+    """The segments that raters see."""
+
+    segments: int = 4000  # segments to collect
+    length: int = 12  # steps of a segment
+    memmap: str | None = None  # folder for memory-mapped storage; in memory if null
+    load: str | None = None  # folder 'data' of an earlier run: its segments and preferences
+    save: bool = True  # keep segments and preferences in the run folder
+    store: str | None = None  # folder in which segments are kept for other runs; none if null
+    seed: int | None = None  # of the segments; that of the run if null
+
+    def check(self, at: Checker) -> None:
+        """Report values that are out of range."""
+        at.at_least_one(self, "length")
+        at.expect(self.segments >= 2, "segments", "at least 2, to compare", self.segments)
+        if self.load is not None:
+            found = (Path(self.load) / "segments").is_dir()
+            at.expect(found, "load", "the folder 'data' of an earlier run", self.load)

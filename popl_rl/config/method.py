@@ -1,0 +1,218 @@
+"""Settings of methods: how hypotheses are learnt. A section says which methods it concerns."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from popl_rl.config.checks import Checker, parse_epsilon
+
+__all__ = [
+    "SECTIONS",
+    "CloneSettings",
+    "EMSettings",
+    "MethodConfig",
+    "MixtureSettings",
+    "POPLSettings",
+    "RefinementSettings",
+    "Training",
+    "VPLSettings",
+]
+
+
+@dataclass
+class Training:
+    """The recipe by which all are trained: every method, the oracle and pooled CPL."""
+
+    alpha: float = 0.25  # scale of the scores (CPL's temperature); smaller makes sharper policies
+    conservatism: float = 0.8  # lambda of the CPL loss, in (0, 1]; 1 for reward functions
+    slip: float = 0.05  # chance of a slip that the likelihood of an answer reckons with
+    discount: float = 1.0  # per-step discount of the scores
+    learning_rate: float = 2e-3  # of Adam; held for half of the generations, then falls to zero
+    batch_size: int = 256  # preferences per CPL step and hypothesis
+    steps: int = 1500  # CPL steps of a hypothesis in all, divided among the generations
+
+    def check(self, at: Checker) -> None:
+        """Report values that are out of range."""
+        at.positive(self, "alpha", "learning_rate")
+        at.share(self, "conservatism", "discount")
+        at.at_least_one(self, "batch_size", "steps")
+        at.expect(0 <= self.slip < 0.5, "slip", "in [0, 0.5)", self.slip)
+
+
+@dataclass
+class POPLSettings:
+    """Selection and variation of POPL."""
+
+    selection: str = "lexicase"  # of parents: lexicase or a reference of kind selection
+    tournament: int = 4  # members in a tournament (selection=tournament)
+    epsilon: str | None = "mad"  # tolerance of lexicase: mad, a number, or null for none
+    variation: str = "auto"  # gradient, gaussian (published), mixtures; auto goes by the cases
+    rater_similarity: bool = True  # children learn from raters like the one they are for (ids)
+    specialist_steps: int = 30  # CPL steps of the specialist for each rater (rater_similarity)
+    pooled_steps: int = 200  # CPL steps on all answers: features=pooled, or before specialists
+    warm_up: int = 20  # CPL steps on all answers before the first generation (no similarity)
+    features: str = (
+        "random"  # trunk of heads: random (published), or pooled: trained on all answers
+    )
+    mutation_std: float = 0.1  # standard deviation of a mutation (gaussian)
+
+    def check(self, at: Checker) -> None:
+        """Report values that are out of range."""
+        at.at_least_one(self, "tournament", "specialist_steps", "pooled_steps")
+        at.one_of(self, "variation", ("auto", "gradient", "gaussian", "mixtures"))
+        at.one_of(self, "features", ("random", "pooled"))
+        at.not_negative(self, "warm_up")
+        at.positive(self, "mutation_std")
+        at.expect(bool(self.selection), "selection", "lexicase or a reference", self.selection)
+        try:
+            parse_epsilon(self.epsilon)
+        except ValueError as error:
+            at.problems.append(str(error))
+
+
+@dataclass
+class RefinementSettings:
+    """POPL's last training: which members to keep, each trained on the raters whom it serves."""
+
+    steps: int = 1500  # CPL steps; 0 for none (policies, gradient variation, rater ids)
+    folds: int = 4  # folds of the cross-fitting
+    most: int = 8  # members to begin with, at most
+
+    def check(self, at: Checker) -> None:
+        """Report values that are out of range."""
+        at.not_negative(self, "steps")
+        at.at_least_one(self, "most")
+        at.expect(self.folds >= 2, "folds", "at least 2", self.folds)
+
+
+@dataclass
+class MixtureSettings:
+    """POPL without rater ids: lexicase selection among mixtures of policies."""
+
+    mixtures: int = 24  # mixtures in the population
+    generations: int = 24  # generations, with selection from the 14th on
+    steps: int = 60  # CPL steps of a generation
+    block: int = 15  # CPL steps from one E-step to the next
+    held_out: float = 0.2  # share of the preferences that only selection sees
+    bundle: int = 20  # held-out preferences of a lexicase case
+    first_selection: int = 14  # generation after which selection begins
+    exchange: float = 0.15  # chance that a further child swaps a member with another mixture
+    removal: float = 0.15  # chance that a further child loses a member
+    final_steps: int = 1000  # CPL steps of the final, cross-fitted training
+    final_batch_size: int = 1000  # preferences per step of it, the same for all members
+    folds: int = 4  # folds of it
+
+    def check(self, at: Checker) -> None:
+        """Report values that are out of range."""
+        names = ("mixtures", "generations", "steps", "block", "bundle", "first_selection")
+        at.at_least_one(self, *names, "final_steps", "final_batch_size")
+        at.expect(self.folds >= 2, "folds", "at least 2", self.folds)
+        for name in ("held_out", "exchange", "removal"):
+            value = getattr(self, name)
+            at.expect(0 <= value < 1, name, "in [0, 1)", value)
+
+
+@dataclass
+class CloneSettings:
+    """The behaviour-cloned network that style codes are fed to (``method.evolve=code``)."""
+
+    code_dim: int = 2  # numbers in a style code
+    steps: int = 3000  # gradient steps of behaviour cloning
+    beta: float = 1e-3  # weight of the codes' divergence from their prior
+
+    def check(self, at: Checker) -> None:
+        """Report values that are out of range."""
+        at.at_least_one(self, "code_dim", "steps")
+        at.not_negative(self, "beta")
+
+
+@dataclass
+class EMSettings:
+    """EM mixtures, which are told the number of groups."""
+
+    groups: int | None = None  # that number; null: as many as there are rater groups
+
+    def check(self, at: Checker) -> None:
+        """Report values that are out of range."""
+        if self.groups is not None:
+            at.at_least_one(self, "groups")
+
+
+@dataclass
+class VPLSettings:
+    """Variational preference learning."""
+
+    latent: int = 8  # numbers that say what a rater wants
+    kl: float = 0.1  # weight of their divergence from N(0, 1)
+    answers: int = 16  # answers of each rater in a batch
+
+    def check(self, at: Checker) -> None:
+        """Report values that are out of range."""
+        at.at_least_one(self, "latent", "answers")
+        at.not_negative(self, "kl")
+
+
+#: Sections of ``method`` by name: what ``method.reads`` may list.
+SECTIONS = {
+    "training": Training,
+    "popl": POPLSettings,
+    "refinement": RefinementSettings,
+    "mixture": MixtureSettings,
+    "clone": CloneSettings,
+    "em": EMSettings,
+    "vpl": VPLSettings,
+}
+
+
+@dataclass
+class MethodConfig:
+    """How hypotheses are learnt: the method, what it evolves, and a section for each part."""
+
+    name: str = "popl"  # what its rows are called in results.csv
+    factory: str = "popl_rl.algorithms.assembly:build_popl"  # reference of kind method
+    # Sections that the method is built from; settings of others are refused.
+    reads: list[str] = field(default_factory=lambda: ["training", "popl", "refinement", "mixture"])
+    needs_ids: bool = False  # whether the method lives on rater ids
+    learns: str = "auto"  # policy, reward; auto: reward where there is nothing to do but judge
+    cases: str = "rater"  # what lexicase filters on: rater (needs rater ids) or preference
+    evolve: str = "all"  # all: whole networks; head: last layers on a shared, frozen trunk; code:
+    # style codes fed to a network that was cloned from the data's behaviour and is frozen
+    hidden: list[int] = field(default_factory=lambda: [64, 64])  # units of each hidden layer
+    members: int = 32  # hypotheses in the population; em: as many mixtures as fit
+    generations: int = 100  # in which the steps of the training are divided
+    training: Training = field(default_factory=Training)
+    popl: POPLSettings = field(default_factory=POPLSettings)
+    refinement: RefinementSettings = field(default_factory=RefinementSettings)
+    mixture: MixtureSettings = field(default_factory=MixtureSettings)
+    clone: CloneSettings = field(default_factory=CloneSettings)
+    em: EMSettings = field(default_factory=EMSettings)
+    vpl: VPLSettings = field(default_factory=VPLSettings)
+    options: dict[str, Any] = field(default_factory=dict)  # further arguments of the factory
+
+    def check(self, at: Checker) -> None:
+        """Report values that are out of range, or do not go together."""
+        at.expect(bool(self.name), "name", "a name", self.name)
+        at.expect(bool(self.factory), "factory", "a reference of a method", self.factory)
+        unknown = [name for name in self.reads if name not in SECTIONS]
+        at.expect(not unknown, "reads", f"sections out of {', '.join(SECTIONS)}", unknown)
+        at.one_of(self, "learns", ("auto", "policy", "reward"))
+        at.expect(self.cases in ("rater", "preference"), "cases", "rater or preference", self.cases)
+        at.one_of(self, "evolve", ("all", "head", "code"))
+        at.at_least_one(self, "members", "generations")
+        at.expect(all(units >= 1 for units in self.hidden), "hidden", "positive", self.hidden)
+        for name in SECTIONS:
+            getattr(self, name).check(at.below(name))
+        self._check_together(at)
+
+    def _check_together(self, at: Checker) -> None:
+        cure = "rater, because it reads what one rater said"
+        at.expect(self.cases == "rater" or not self.needs_ids, "cases", cure, self.cases)
+        if self.evolve == "code":
+            at.expect(self.learns != "reward", "learns", "policy for style codes", self.learns)
+        if "popl" not in self.reads:
+            return
+        at.expect(self.members >= 2, "members", "at least 2, to select among", self.members)
+        if self.popl.variation == "gaussian":
+            at.expect(self.evolve == "head", "evolve", "head for Gaussian variation", self.evolve)
+        mixtures = self.popl.variation == "mixtures"
+        if mixtures or (self.cases == "preference" and self.popl.variation == "auto"):
+            at.expect(self.evolve != "code", "evolve", "all without rater ids", self.evolve)

@@ -1,0 +1,84 @@
+"""Settings of a whole run, and one check of it all."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from omegaconf import MISSING, DictConfig, OmegaConf
+
+from popl_rl.config.checks import Checker
+from popl_rl.config.data import DataConfig, EnvConfig, RatersConfig
+from popl_rl.config.evaluation import EvaluationConfig
+from popl_rl.config.method import MethodConfig
+
+__all__ = ["Config", "EvaluateConfig", "LoggerConfig", "plain", "validate"]
+
+
+@dataclass
+class LoggerConfig:
+    """Where metrics go besides metrics.csv."""
+
+    name: str = "wandb"  # wandb (offline) or csv (nothing more)
+    project: str = "popl_rl"
+
+    def check(self, at: Checker) -> None:
+        """Report values that are out of range."""
+        at.expect(self.name in ("wandb", "csv"), "name", "wandb or csv", self.name)
+
+
+@dataclass
+class EvaluateConfig:
+    """What popl-evaluate does with a finished run."""
+
+    run_dir: str = MISSING  # folder of the run
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    seed: int = 0  # of the held-out pairs, new raters and episodes
+
+
+@dataclass
+class Config:
+    """A whole run."""
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    raters: RatersConfig = field(default_factory=RatersConfig)
+    data: DataConfig = field(default_factory=DataConfig)
+    method: MethodConfig = field(default_factory=MethodConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    logger: LoggerConfig = field(default_factory=LoggerConfig)
+    seed: int = 0
+    device: str = "cpu"  # where policies are trained: cpu or cuda
+    threads: int = 1  # torch threads; on small networks more is slower
+    run_dir: str | None = None  # folder of the run; runs/<time>-<method>-<seed> if null
+    resume: str | None = None  # folder of a killed run to finish
+    checkpoint_interval: int = 10  # generations between checkpoints
+
+    def check(self, at: Checker) -> None:
+        """Report values that are out of range."""
+        for name in ("env", "raters", "data", "method", "evaluation", "logger"):
+            getattr(self, name).check(at.below(name))
+        proper = self.device.split(":")[0] in ("cpu", "cuda")
+        at.expect(proper, "device", "cpu or cuda", self.device)
+        at.at_least_one(self, "threads", "checkpoint_interval")
+        if self.method.evolve != "code" and self.evaluation.reference != "clone":
+            return
+        at.expect(self.method.learns != "reward", "method.learns", "policy for a clone", "reward")
+
+
+def plain(config: Any) -> Any:
+    """The dataclasses of a configuration that Hydra composed, with references resolved.
+
+    Args:
+        config: A ``DictConfig`` with a schema of this package, or such a dataclass.
+    """
+    return OmegaConf.to_object(config) if isinstance(config, DictConfig) else config
+
+
+def validate(config: Config) -> None:
+    """Check values that can be checked before anything is built.
+
+    Raises:
+        ValueError: Listing every problem at once, each with what was expected and what came.
+    """
+    problems: list[str] = []
+    plain(config).check(Checker("", problems))
+    if problems:
+        raise ValueError("the configuration has problems:\n  " + "\n  ".join(problems))

@@ -1,0 +1,318 @@
+"""The steps of a training run, in the order in which ``trainers/train_popl.py`` takes them."""
+
+import logging
+import shutil
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from omegaconf import OmegaConf
+
+from popl_rl.algorithms.problem import Method, Problem
+from popl_rl.algorithms.reward_baselines import RewardBaselines, train_reward_baselines
+from popl_rl.algorithms.trainer import MethodTrainer
+from popl_rl.config import Config, plain, validate
+from popl_rl.data.comparisons import Comparisons
+from popl_rl.data.environments import World, build_world, indexed, is_stateless
+from popl_rl.evaluation.diagnostics import diagnostics
+from popl_rl.evaluation.evaluator import Evaluator
+from popl_rl.evaluation.results import Scoreboard
+from popl_rl.experiments.builders import (
+    build_clone,
+    build_method,
+    build_problem,
+    build_spec,
+    train_baselines,
+)
+from popl_rl.experiments.data import Data, build_groups, make_data
+from popl_rl.experiments.evaluators import make_evaluator
+from popl_rl.experiments.loggers import Progress, RunLogger, make_logger
+from popl_rl.experiments.metrics import MetricsWriter
+from popl_rl.experiments.report import markdown
+from popl_rl.experiments.run_folder import (
+    create_run_dir,
+    load_config,
+    save_config,
+    write_metadata,
+)
+from popl_rl.models.hypothesis_set import HypothesisSet
+from popl_rl.models.reward_functions import RewardSpec
+from popl_rl.models.sets import as_set
+from popl_rl.models.style_population import StyledPopulation
+from popl_rl.randomness import stream
+from popl_rl.raters.groups import RaterGroup
+from popl_rl.storage import write_atomic
+
+__all__ = [
+    "References",
+    "Setting",
+    "build",
+    "draw",
+    "evaluate",
+    "evolve",
+    "gather",
+    "log_results",
+    "open_logger",
+    "open_run",
+    "train_references",
+    "write_report",
+]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Where a run takes place, what raters said there, and who evaluates.
+
+    Attributes:
+        world: Environment.
+        groups: G hidden groups; the learner gets none of them.
+        data: Segments and preferences.
+        problem: What methods are given.
+        evaluator: Evaluates sets for every group.
+    """
+
+    world: World
+    groups: tuple[RaterGroup, ...]
+    data: Data
+    problem: Problem
+    evaluator: Evaluator
+
+
+@dataclass(frozen=True)
+class References:
+    """What a set is compared with, trained on the same data by the same recipe.
+
+    Attributes:
+        baselines: Pooled CPL, then the oracle of each group; None if they were not asked for.
+        rewards: B-REX and DPL, where items are judged.
+    """
+
+    baselines: HypothesisSet | None
+    rewards: RewardBaselines | None
+
+
+def open_run(config: Config, *, command: Sequence[str]) -> tuple[Config, Path]:
+    """Make the folder of a run, or find the one to continue with its own settings.
+
+    Raises:
+        ValueError: If settings are off.
+        OSError: If the folder exists already, or there is no run to resume.
+    """
+    if config.resume is not None:
+        run_dir = create_run_dir(Path(config.resume), name="", resume=True)
+        config = plain(OmegaConf.merge(OmegaConf.structured(Config), load_config(run_dir)))
+        validate(config)
+    else:
+        validate(config)
+        name = f"{config.method.name}-seed{config.seed}"
+        wanted = None if config.run_dir is None else Path(config.run_dir)
+        run_dir = create_run_dir(wanted, name=name)
+        save_config(run_dir, config)
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # TorchRL sets its own when imported
+    write_metadata(run_dir, command=command)
+    torch.set_num_threads(config.threads)
+    return config, run_dir
+
+
+def gather(config: Config, run_dir: Path) -> Setting:
+    """Collect segments and ask the raters, or load what an earlier run collected."""
+    world = build_world(config.env)
+    groups = build_groups(config.raters, world)
+    kept = run_dir / "data"
+    load = kept if (kept / "preferences").is_dir() else None
+    if load is None and config.data.load is not None:
+        load = Path(config.data.load)
+    with Progress("segments", total=config.data.segments) as progress:
+        data = make_data(
+            config.data,
+            config.raters,
+            world,
+            groups,
+            seed=config.seed,
+            env=config.env,
+            load=load,
+            progress=progress.update,
+        )
+    if config.data.save:
+        data.save(kept)
+    spec = build_spec(config.method, world.env)
+    bank = spec.bank(indexed(data.steps, world.env.action_space)).to(config.device)
+    comparisons = Comparisons.from_preferences(data.preferences, cases=config.method.cases)
+    clone, typical = None, None
+    if config.method.evolve == "code" or config.evaluation.reference == "clone":
+        with Progress("cloning", total=config.method.clone.steps) as progress:
+            clone = build_clone(
+                config.method,
+                spec,
+                bank,
+                seed=config.seed,
+                path=run_dir if data.store is None else data.store.parent,
+                progress=progress.update,
+            )
+        alone = StyledPopulation(clone, clone.typical().unsqueeze(0))
+        typical = as_set(alone, alpha=config.method.training.alpha)
+        _save_anew(typical, run_dir / "clone")
+    comparisons = comparisons.to(config.device)
+    problem = build_problem(config.method, spec, bank, comparisons, clone=clone)
+    evaluator = make_evaluator(config, world, groups, data, spec, clone=typical, seed=config.seed)
+    return Setting(world, groups, data, problem, evaluator)
+
+
+def open_logger(config: Config, run_dir: Path) -> AbstractContextManager[RunLogger]:
+    """Where the run reports to while it goes on."""
+    settings: Any = OmegaConf.to_container(OmegaConf.structured(config), resolve=True)
+    name: Any = config.logger.name
+    return make_logger(name, run_dir, project=config.logger.project, config=settings)
+
+
+def build(config: Config, setting: Setting) -> Method:
+    """The method, with a population to start from."""
+    generator = stream(config.seed, "learner", config.device)
+    groups = len(setting.groups)
+    return build_method(config.method, setting.problem, num_groups=groups, generator=generator)
+
+
+def evolve(
+    config: Config, setting: Setting, method: Method, run_dir: Path, logger: RunLogger
+) -> HypothesisSet:
+    """Run the generations that are still to come, and keep the set that they find."""
+    metrics = MetricsWriter(run_dir / "metrics.csv")
+    history = MetricsWriter(run_dir / "history.csv")
+    every, last = config.evaluation.history, method.generations
+    with Progress("generations", total=last) as progress:
+
+        def on_generation(generation: int, values: dict[str, float]) -> None:
+            metrics.write(generation, values)
+            logger.log(values, generation)
+            progress.update(generation, worst_rater_accuracy=values["worst_rater_accuracy"])
+            if every and (generation % every == 0 or generation in (1, last)):
+                now = setting.problem.hypothesis_set(method.population)
+                history.write(generation, setting.evaluator.snapshot(now))
+
+        trainer = MethodTrainer(
+            method,
+            generations=last,
+            checkpoint_dir=run_dir / "checkpoint",
+            checkpoint_interval=config.checkpoint_interval,
+            on_generation=on_generation,
+        )
+        done = trainer.resume()
+        metrics.truncate_to(done)
+        history.truncate_to(done)
+        trainer.train()
+    found = method.result()
+    _save_anew(found, run_dir / found.folder)
+    return found
+
+
+def train_references(config: Config, setting: Setting, run_dir: Path) -> References:
+    """Pooled CPL, the oracles and, where items are judged, B-REX and DPL."""
+    options, problem = config.evaluation, setting.problem
+    baselines, rewards = None, None
+    if options.baselines:
+        with Progress("baselines", total=problem.generations) as progress:
+            baselines = train_baselines(
+                options,
+                problem,
+                setting.data.preferences,
+                num_groups=len(setting.groups),
+                generator=stream(config.seed, "baselines", config.device),
+                progress=progress.update,
+            )
+        _save_anew(baselines, run_dir / "baselines")
+    if options.reward_baselines and is_stateless(setting.world.env):
+        rewards = train_reward_baselines(
+            cast("RewardSpec", problem.spec),
+            problem.bank,
+            problem.comparisons,
+            brex_steps=options.brex_steps,
+            dpl_steps=options.dpl_steps,
+            generator=stream(config.seed, "rivals", config.device),
+        )
+    return References(baselines, rewards)
+
+
+def evaluate(
+    config: Config,
+    setting: Setting,
+    found: HypothesisSet,
+    references: References,
+    run_dir: Path,
+) -> Scoreboard:
+    """What the set is worth to every group; writes ``results.csv``."""
+    board = setting.evaluator.score(
+        found,
+        references.baselines,
+        reward_baselines=references.rewards,
+        label=config.method.name,
+    )
+    write_atomic(run_dir / "results.csv", board.results.to_csv(index=False))
+    return board
+
+
+def draw(
+    setting: Setting,
+    found: HypothesisSet,
+    references: References,
+    board: Scoreboard,
+    run_dir: Path,
+) -> dict[str, Path]:
+    """Every picture that the run has the data for."""
+    from popl_rl.plotting import run_figures  # matplotlib only where figures are drawn
+
+    return run_figures.draw(
+        run_dir,
+        found,
+        references.baselines,
+        board=board,
+        evaluator=setting.evaluator,
+        world=setting.world,
+        reward_baselines=references.rewards,
+    )
+
+
+def log_results(
+    logger: RunLogger, board: Scoreboard, figures: dict[str, Path], generation: int
+) -> None:
+    """Hand table and figures to the logger."""
+    logger.log_figures(figures, generation)
+    logger.log_table("results", board.results)
+
+
+def write_report(
+    config: Config,
+    setting: Setting,
+    found: HypothesisSet,
+    board: Scoreboard,
+    figures: dict[str, Path],
+    run_dir: Path,
+) -> None:
+    """Write ``report.md``."""
+    problem = setting.problem
+    comparisons, method = problem.comparisons, config.method
+    effective = found.effective_number(problem.bank, comparisons)
+    about = {
+        f"{found.folder} in the set": f"{len(found)}, effectively {effective:.1f}",
+        "comparisons": f"{len(comparisons)} strict, {comparisons.num_dropped} ties and skips",
+        "cases": f"{comparisons.num_cases} ({method.cases}s)",
+        "recipe": ", ".join(f"{name} {value:g}" for name, value in vars(method.training).items()),
+        "seed": config.seed,
+        **diagnostics(board, setting.evaluator),
+    }
+    title = f"{'POPL: ' if method.name == 'popl' else ''}{method.name} in {config.env.factory}"
+    text = markdown(
+        board.results,
+        title=title,
+        about=about,
+        figures=[Path("figures") / path.name for path in figures.values()],
+    )
+    write_atomic(run_dir / "report.md", text)
+
+
+def _save_anew(found: HypothesisSet, path: Path) -> None:
+    """Save a set in the place of what a killed run may have left."""
+    shutil.rmtree(path, ignore_errors=True)
+    found.save(path)
