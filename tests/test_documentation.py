@@ -20,10 +20,7 @@ READMES = [Path(f, "README.md") for f in ("", "popl_rl", "envs", "trainers", "co
 PAGES = [*READMES, *(Path(".github", name) for name in ("CONTRIBUTING.md", "CHANGELOG.md"))]
 TEXT = {page: (ROOT / page).read_text(encoding="utf-8") for page in PAGES}
 CONFIGS = {"popl-train": "train", "popl-evaluate": "evaluate", "popl-benchmark": "benchmark"}
-# Settings of sections that come with the methods as plug-ins.
-SECTIONS = re.compile(
-    r"method\.(factory|training|popl|refinement|mixture|clone|em|vpl|options)\b", re.ASCII
-)
+NOT_TRAINING = ("method.popl.", "method.refinement.", "method.mixture.")
 
 
 def blocks(page, language):
@@ -80,8 +77,6 @@ def test_commands_name_settings_that_exist(command, config_of):
     overrides = [o for o in overrides if not o.startswith(("hydra/launcher=", "hydra.launcher."))]
     if sweep:
         overrides = [first_value(override) for override in overrides]
-    if any(SECTIONS.match(override) for override in overrides):
-        pytest.importorskip("popl_rl.algorithms.problem")
     assert config_of(*overrides, name=CONFIGS[program])
 
 
@@ -147,7 +142,6 @@ def documented_settings(section):
 
 @pytest.mark.parametrize("section", ["raters", "data", "method", "evaluation"])
 def test_every_setting_is_documented_and_exists(section):
-    pytest.importorskip("popl_rl.algorithms.problem")
     existing = set(settings_of(getattr(Config(), section)))
     named = documented_settings(section)
     whole = tuple(name.removesuffix("...") + "." for name in named if name.endswith("..."))
@@ -177,17 +171,16 @@ def test_the_data_shown_can_be_learnt_from(config_of, tiny, tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("what", "setting"),
-    [
-        ("class NoisyLexicase", "method.factory=mine.py:NoisyLexicase"),
-        ("def lucky_case", "method.popl.selection=mine.py:lucky_case"),
-    ],
+    ("what", "file"), [("class NoisyLexicase", "my_method.py"), ("def lucky_case", "my_rules.py")]
 )
-def test_plug_ins_of_the_method_can_be_used(what, setting, config_of, tiny, tmp_path, monkeypatch):
-    pytest.importorskip("popl_rl.algorithms.problem")
+def test_plug_ins_of_the_method_can_be_used(what, file, config_of, tiny, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path("mine.py").write_text(block_with("popl_rl/README.md", what))
-    result = train_popl.run(config_of(*tiny, setting, "run_dir=run"))
+    Path(file).write_text(block_with("popl_rl/README.md", what))
+    [command] = [command for command in COMMANDS if file in command]
+    overrides = shlex.split(command)[1:]
+    # A setting of a section that the method does not read is refused.
+    read = [o for o in tiny if what != "class NoisyLexicase" or not o.startswith(NOT_TRAINING)]
+    result = train_popl.run(config_of(*read, *overrides, "run_dir=run"))
     assert len(result.policies) >= 1
 
 
