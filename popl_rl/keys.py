@@ -18,7 +18,7 @@ Preferences, batch size ``[M]``:
 | ``answer`` | ``[M]`` | int64 | an :class:`Answer` |
 | ``rater`` | ``[M]`` | int64 | id of the person who answered |
 | ``("hidden", "group")`` | ``[M]`` | int64 | group of that person. For evaluation only |
-| ``("hidden", "utility")`` | ``[M, 2]`` | float32 | segment_utility of each segment. For evaluation only |
+| ``("hidden", "utility")`` | ``[M, 2]`` | float32 | utility of each segment. For evaluation only |
 """
 
 from enum import IntEnum

@@ -7,10 +7,10 @@ that together should explain whatever is preferred:
 
     p(preference) = sum_k share_k sigmoid(Delta_k)
 
-Members of a mixture divide the preferences among themselves by responsibility and train on those they
-speak for: EM (Dempster, Laird and Rubin, 1977), as in MaxMin-RLHF (Chakraborty et al., 2024), but
-over policies and without being told how many groups there are. Mixtures are selected by lexicase on
-small bundles of *held-out* preferences, and the smallest mixture that is as good as the best is the
+Members of a mixture divide the preferences among themselves by responsibility and train on those
+they speak for: EM (Dempster, Laird and Rubin, 1977), as in MaxMin-RLHF (Chakraborty et al., 2024),
+but over policies and without being told how many groups there are. Mixtures are selected by lexicase
+on small bundles of *held-out* preferences, and the smallest mixture that is as good as the best is the
 result.
 """
 
@@ -106,8 +106,8 @@ class MixturePOPL:
             Scalars to log: ``worst_rater_accuracy`` (share of held-out preferences that some
             member of the best mixture passes), ``mean_accuracy`` of all members on them,
             ``held_out_likelihood`` of the best mixture (mean log),
-            ``selection_depth``, ``distinct`` mixtures, ``effective_parents``, ``mixture_size`` of the
-            best mixture and ``loss``.
+            ``selection_depth``, ``distinct`` mixtures, ``effective_parents``, ``mixture_size`` of
+            the best mixture and ``loss``.
         """
         settings = self.settings
         value = math.nan
@@ -208,7 +208,7 @@ class MixturePOPL:
         return problem.likelihood(problem.scores(population))
 
     def _held_out(self) -> tuple[Tensor, Tensor]:
-        """Passes ``[N, H]`` and robust log-likelihoods ``[mixtures, H]`` of held-out preferences."""
+        """Passes ``[N, H]`` and robust log-likelihoods ``[mixtures, H]`` of what is held out."""
         scores, held = self.held.scores(self.population), self.held.comparisons
         passes = scores[:, held.preferred] > scores[:, held.other]
         likelihood = self._expect(self.held.likelihood(scores)).evidence.exp()

@@ -21,8 +21,8 @@ from popl_rl.selection.lexicase import SelectionReport, lexicase_given_first, le
 from popl_rl.selection.mad import mad
 from popl_rl.selection.rules import Selection, report
 
-#: What a child learns from similar raters on whom its parent is weak, against 1 where it is strong. Without
-#: it a first child for a small group learns from the one or two raters that its parent happens to
+#: What a child learns from similar raters on whom its parent is weak, against 1 where it is strong.
+#: Without it a first child for a small group learns from the one or two raters that its parent happens to
 #: pass; much more of it blurs groups that are each other's nearest.
 _FLOOR = 0.2
 

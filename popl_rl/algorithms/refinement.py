@@ -146,7 +146,8 @@ class _CrossFitting:
         return self.problem.likelihood(self.problem.scores(population))
 
     def _by_copy(self) -> Tensor:
-        return self._likelihood(self.copies).unflatten(0, (self.folds + 1, -1))
+        likelihood: Tensor = self._likelihood(self.copies).unflatten(0, (self.folds + 1, -1))
+        return likelihood
 
     def drop(self) -> None:
         """Keep the members that held-out answers need."""

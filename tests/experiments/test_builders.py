@@ -418,7 +418,7 @@ def test_vpl_needs_ids_policies_and_whole_networks(learner, learning):
     alone = Comparisons(comparisons.preferred, comparisons.other, torch.arange(count), count)
     with pytest.raises(ValueError, match="method vpl needs rater ids"):
         built(learner, (spec, bank, alone), **vpl)
-    with pytest.raises(ValueError, match="method.evolve must be all for method vpl"):
+    with pytest.raises(ValueError, match=r"method\.evolve must be all for method vpl"):
         built(learner, learning, evolve="head", **vpl)
     with pytest.raises(ValueError, match="method vpl learns policies, not reward functions"):
         built(learner, (RewardSpec(5, 2, (6,)), bank, comparisons), **vpl)

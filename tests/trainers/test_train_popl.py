@@ -9,7 +9,6 @@ from omegaconf import OmegaConf
 
 from popl_rl.algorithms.vpl import EncodedPolicySet
 from popl_rl.evaluation.statistics import RESULT_COLUMNS, read_results
-from popl_rl.randomness import stream
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.population import Population
