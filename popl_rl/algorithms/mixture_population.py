@@ -9,9 +9,9 @@ that together should explain whatever is preferred:
 
 Members of a mixture divide the preferences among themselves by responsibility and train on those
 they speak for: EM (Dempster, Laird and Rubin, 1977), as in MaxMin-RLHF (Chakraborty et al., 2024),
-but over policies and without being told how many groups there are. Mixtures are selected by lexicase
-on small bundles of *held-out* preferences, and the smallest mixture that is as good as the best is the
-result.
+but over policies and without being told how many groups there are. Mixtures are selected by
+lexicase on small bundles of *held-out* preferences, and the smallest mixture that is as good as the
+best is the result.
 """
 
 import copy

@@ -22,8 +22,8 @@ from popl_rl.selection.mad import mad
 from popl_rl.selection.rules import Selection, report
 
 #: What a child learns from similar raters on whom its parent is weak, against 1 where it is strong.
-#: Without it a first child for a small group learns from the one or two raters that its parent happens to
-#: pass; much more of it blurs groups that are each other's nearest.
+#: Without it a first child for a small group learns from the one or two raters that its parent
+#: happens to pass; much more of it blurs groups that are each other's nearest.
 _FLOOR = 0.2
 
 __all__ = ["POPL"]

@@ -11,7 +11,7 @@ from popl_rl.evaluation.diagnostics import alarm
 from popl_rl.evaluation.evaluator import Evaluator
 from popl_rl.evaluation.measures import group_returns
 from popl_rl.evaluation.statistics import RESULT_COLUMNS, rows_of
-from popl_rl.experiments.builders import build_groups
+from popl_rl.experiments.data import build_groups
 from popl_rl.models.hypothesis_set import Catered
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet

@@ -10,7 +10,7 @@ from popl_rl.config import EnvConfig, RatersConfig
 from popl_rl.data.environments import build_world
 from popl_rl.evaluation.measures import group_returns, roll_out
 from popl_rl.evaluation.optimum import ExactReturns, action_probabilities, optimal_return
-from popl_rl.experiments.builders import build_groups
+from popl_rl.experiments.data import build_groups
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.population import Population
