@@ -6,7 +6,7 @@ In the terms of La Cava et al. (2019, doi 10.1162/evco_a_00224). Nothing here ch
 import torch
 from torch import Tensor
 
-from popl_rl.selection.mad import median_absolute_deviation
+from popl_rl.selection.mad import mad
 
 __all__ = ["select_dynamically"]
 
@@ -40,7 +40,7 @@ def select_dynamically(
             order = torch.randperm(scores.shape[1], generator=generator, device=device)[:limit]
             for depth, case in enumerate(order.tolist(), start=1):
                 values = scores[pool, case]
-                tolerance = median_absolute_deviation(values[:, None])
+                tolerance = mad(values[:, None])
                 stay = values >= values.amax() - tolerance
                 if bool(stay.all()):
                     continue

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from popl_rl.selection.mad import median_absolute_deviation
+from popl_rl.selection.mad import mad
 
 __all__ = ["Epsilon", "prepare_scores", "tolerance_per_case"]
 
@@ -28,7 +28,7 @@ class Epsilon:
             wanted = wanted[self.values[wanted].isnan()]
             for part in torch.split(wanted, max(1, 2**22 // len(self.scores))):
                 columns = self.scores.gather(1, part.expand(len(self.scores), -1))
-                self.values[part] = median_absolute_deviation(columns)
+                self.values[part] = mad(columns)
             self.missing -= len(wanted)
         return self.values[cases]
 

@@ -4,22 +4,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["mad", "median_absolute_deviation"]
+__all__ = ["mad"]
 
 
 def mad(values: Tensor) -> Tensor:
-    """Median absolute deviation of each case over the population, ``[N, C] -> [C]``.
+    """Median absolute deviation of each case over the members.
 
-    The tolerance of epsilon-lexicase selection (La Cava et al., 2016).
+    Median distance from the median (La Cava, Spector and Danai, 2016). With an even number of
+    members a median is the mean of the two values in the middle.
+
+    Args:
+        values: ``[member, case]``, float32 or float64, finite.
+
+    Returns:
+        ``[case]``, without gradients.
     """
-    middle = values.median(0).values
-    return (values - middle).abs().median(0).values
-
-
-def median_absolute_deviation(values: Tensor) -> Tensor:
-    """Median distance from the median of each column: ``[member, case] -> [case]``."""
-    values = values.detach().T.contiguous()
-    return _median((values - _median(values)[:, None]).abs_())
+    columns = values.detach().T.contiguous()
+    return _median((columns - _median(columns)[:, None]).abs_())
 
 
 def _median(values: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from popl_rl.selection import behaviours
 from popl_rl.selection.lexicase import SelectionReport, lexicase_report, lexicase_selection
-from popl_rl.selection.mad import median_absolute_deviation
+from popl_rl.selection.mad import mad
 from popl_rl.selection.pools import PassPools, ScorePools
 from popl_rl.selection.rounds import Round
 
@@ -125,7 +125,7 @@ def test_parents_and_depths_follow_the_enumerated_orders(way, scores, limit):
 @pytest.mark.parametrize("epsilon", [0.0, 0.15, 1.0, [0.15, 0.5, 0.0, 3.0], "mad"])
 def test_semi_dynamic_epsilon_follows_the_enumerated_orders(way, epsilon, limit):
     scores = REALS.double()
-    tolerance = median_absolute_deviation(scores).tolist() if epsilon == "mad" else epsilon
+    tolerance = mad(scores).tolist() if epsilon == "mad" else epsilon
     tolerance = [tolerance] * 4 if isinstance(tolerance, float) else tolerance
     report = lexicase_report(
         scores,
@@ -140,7 +140,7 @@ def test_semi_dynamic_epsilon_follows_the_enumerated_orders(way, epsilon, limit)
 @pytest.mark.parametrize("epsilon", [0.15, torch.tensor([0.15, 0.5, 0.0, 3.0]), "mad"])
 def test_static_epsilon_is_lexicase_on_the_passes_of_the_population(epsilon):
     scores = REALS.double()
-    tolerance = median_absolute_deviation(scores) if isinstance(epsilon, str) else epsilon
+    tolerance = mad(scores) if isinstance(epsilon, str) else epsilon
     passes = scores >= scores.amax(0) - tolerance
     report = lexicase_report(
         scores, DRAWS, epsilon=epsilon, epsilon_mode="static", generator=generator(3)
@@ -339,7 +339,7 @@ def test_views_and_gradients_are_no_obstacle():
     assert not scores.is_contiguous()
     for epsilon in (None, "mad"):
         report = lexicase_report(scores, DRAWS, epsilon=epsilon, generator=generator())
-        tolerance = [0.0] * 4 if epsilon is None else median_absolute_deviation(scores).tolist()
+        tolerance = [0.0] * 4 if epsilon is None else mad(scores).tolist()
         assert_distribution(report, scores.detach(), tolerance)
     report = lexicase_report(PASSES.T.contiguous().T, DRAWS, generator=generator())
     assert_distribution(report, PASSES, [0.0] * 5)
@@ -369,7 +369,7 @@ def test_clashing_fingerprints_do_no_harm(monkeypatch):
 def test_selection_on_cuda_follows_the_enumerated_orders(way, scores, epsilon, limit):
     tolerance = [epsilon or 0.0] * scores.shape[1]
     if epsilon == "mad":
-        tolerance = median_absolute_deviation(scores).tolist()
+        tolerance = mad(scores).tolist()
     report = lexicase_report(
         scores.cuda(),
         DRAWS,
