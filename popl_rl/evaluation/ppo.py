@@ -5,7 +5,7 @@ a constant per step, so where an episode can end, whether ending it pays is not 
 the offset of a reward learnt from returns before it is maximised there.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -138,9 +138,8 @@ def train_ppo(
         },
         shares={"discount": discount, "gae_lambda": gae_lambda},
         sizes={"clip_epsilon": clip_epsilon, "learning_rate": learning_rate},
+        entropy=entropy,
     )
-    if not 0 <= entropy < float("inf"):
-        raise ValueError(f"entropy must be 0 or positive, got {entropy}")
 
     network = build_network(spec, generator=generator)
     learner = _Learner(
@@ -158,23 +157,32 @@ def train_ppo(
         act = partial(_act, spec, network, generator=generator)
         done = 0
         while done < frames:
-            rolled: list[TensorDict] = []
-            while sum(map(len, rolled)) < frames_per_batch:
-                rolled.append(roll_episodes(envs, act, max_steps=max_steps, generator=generator))
-            batch: TensorDict = TensorDict.cat(rolled)
-            action = clip_actions(envs[0].action_space, batch[ACTION])
-            gain = _rewards(reward, batch[OBSERVATION], action)
-            over = batch["next", "done"].squeeze(-1)
-            learner.value(batch, gain)
+            batch = _roll_batch(envs, act, frames_per_batch, max_steps, generator)
+            gain = _rewards(reward, batch, envs[0].action_space)
             learner.anneal(1 - done / frames, entropy)
-            learner.update(batch, epochs, minibatch)
+            learner.update(batch, gain, epochs, minibatch)
             done += len(batch)
             if progress is not None:
-                progress(done, float(gain.sum() / over.sum()))
+                progress(done, float(gain.sum() / batch["next", "done"].sum()))
     finally:
         for env in envs:
             env.close()
     return Population([network], spec)
+
+
+def _roll_batch(
+    envs: Sequence[Ending],
+    act: Callable[[TensorDictBase], Tensor],
+    frames: int,
+    max_steps: int,
+    generator: torch.Generator,
+) -> TensorDict:
+    """Whole episodes of at least this many steps, ``[S]``."""
+    rolled: list[TensorDict] = []
+    while sum(map(len, rolled)) < frames:
+        rolled.append(roll_episodes(envs, act, max_steps=max_steps, generator=generator))
+    batch: TensorDict = TensorDict.cat(rolled)
+    return batch
 
 
 class _Learner:
@@ -238,8 +246,16 @@ class _Learner:
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate * left
 
-    def update(self, batch: TensorDict, epochs: int, minibatch: int) -> None:
-        """Take gradient steps on minibatches of a batch ``[S]``, in passes over all of it."""
+    def update(self, batch: TensorDict, gain: Tensor, epochs: int, minibatch: int) -> None:
+        """Take gradient steps on minibatches of a batch ``[S]``, in passes over all of it.
+
+        Args:
+            batch: Steps of whole episodes, one episode after the other.
+            gain: Reward of each step, ``[S]``.
+            epochs: Passes over the batch.
+            minibatch: Steps in each gradient step.
+        """
+        self.value(batch, gain)
         buffer = ReplayBuffer(
             storage=TensorStorage(batch.exclude("next")),
             sampler=SamplerWithoutReplacement(),
@@ -257,7 +273,11 @@ class _Learner:
 
 
 def _check_numbers(
-    *, counts: Mapping[str, int], shares: Mapping[str, float], sizes: Mapping[str, float]
+    *,
+    counts: Mapping[str, int],
+    shares: Mapping[str, float],
+    sizes: Mapping[str, float],
+    entropy: float,
 ) -> None:
     for name, count in counts.items():
         if count < 1:
@@ -268,6 +288,8 @@ def _check_numbers(
     for name, size in sizes.items():
         if not 0 < size < float("inf"):
             raise ValueError(f"{name} must be positive, got {size}")
+    if not 0 <= entropy < float("inf"):
+        raise ValueError(f"entropy must be 0 or positive, got {entropy}")
 
 
 def _check_spec(spec: PolicySpec, env: gymnasium.Env[Any, Any]) -> None:
@@ -290,8 +312,10 @@ def _act(
 
 
 @torch.no_grad()
-def _rewards(reward: RewardFunction, observation: Tensor, action: Tensor) -> Tensor:
-    gain = reward(observation, action)
+def _rewards(reward: RewardFunction, batch: TensorDict, space: gymnasium.Space[Any]) -> Tensor:
+    """Reward of each step of a batch ``[S]``, checked, float32 ``[S]``."""
+    action = clip_actions(space, batch[ACTION])
+    gain = reward(batch[OBSERVATION], action)
     if not isinstance(gain, Tensor) or not gain.is_floating_point():
         kind = gain.dtype if isinstance(gain, Tensor) else type(gain).__name__
         raise TypeError(
