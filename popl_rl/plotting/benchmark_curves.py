@@ -57,8 +57,9 @@ def scenario_dots(suite: Suite, results: pd.DataFrame) -> Figure:
     headline(
         fig,
         "How well is the worst-served group served?",
-        f"{explain_scale(table)}; drawn from −0.5 to 1.25.\n"
-        "Small dots are seeds, large ones their mean with its 95 % interval.",
+        f"{explain_scale(table)}.\n"
+        "Drawn from −0.5 to 1.25. Small dots are seeds, large ones\n"
+        "their mean with its 95 % interval.",
     )
     axes = fig.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
     low = _LOWEST if table["value"].min() < 0 else 0.0
