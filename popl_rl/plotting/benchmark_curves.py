@@ -16,7 +16,7 @@ from popl_rl.evaluation.statistics import entries, headline_measure, interval, w
 from popl_rl.evaluation.suite import Suite
 from popl_rl.plotting.benchmark_style import (
     axis_positions,
-    explain_headline,
+    explain_scale,
     headline_name,
     method_columns,
     method_styles,
@@ -57,8 +57,9 @@ def scenario_dots(suite: Suite, results: pd.DataFrame) -> Figure:
     headline(
         fig,
         "How well is the worst-served group served?",
-        f"{explain_headline(table)}; drawn from −0.5 to 1.25.\n"
-        "Small dots are seeds, large ones their mean with its 95 % interval.",
+        f"{explain_scale(table)}.\n"
+        "Drawn from −0.5 to 1.25. Small dots are seeds, large ones\n"
+        "their mean with its 95 % interval.",
     )
     axes = fig.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
     low = _LOWEST if table["value"].min() < 0 else 0.0
@@ -120,7 +121,7 @@ def catering_curves(suite: Suite, results: pd.DataFrame) -> Figure:
         fig,
         "How many answers does it take to find a new rater's policy?",
         f"{headline_name(table).capitalize()} of the worst-served group, with 95 % intervals over "
-        "seeds. On the right: of the\nbest member in hindsight.",
+        "seeds.\nOn the right: of the best member in hindsight.",
     )
     axes = fig.subplots(len(scenarios), 2, squeeze=False, sharex=True, sharey=True)
     low = max(_LOWEST, min(0.0, float(table["value"].min())))

@@ -18,6 +18,7 @@ __all__ = [
     "axis_positions",
     "ends_of_scale",
     "explain_headline",
+    "explain_scale",
     "headline_name",
     "method_columns",
     "method_styles",
@@ -88,6 +89,17 @@ def explain_headline(table: pd.DataFrame) -> str:
     if set(table["measure"]) == {"recovery"}:
         return "Recovery: (return − floor) / (oracle's return − floor)"
     return "Share of the optimum where it is known, recovery of the oracle's return elsewhere"
+
+
+def explain_scale(table: pd.DataFrame) -> str:
+    """What 1 and 0 are, for the caption of a narrow figure.
+
+    Args:
+        table: Rows as of :func:`popl_rl.evaluation.statistics.worst`.
+    """
+    if set(table["measure"]) == {"share_of_optimum"}:
+        return "Share of optimum: 1 the optimum, 0 random actions"
+    return f"{headline_name(table).capitalize()}: 1 as good as the oracle, 0 as the floor"
 
 
 def ends_of_scale(table: pd.DataFrame) -> tuple[str, str]:

@@ -157,6 +157,23 @@ def test_the_report_has_a_row_for_each_method_and_a_column_for_each_scenario_off
     assert not rows[start + 2].startswith("| other"), "only at one point"
 
 
+def test_the_share_of_optimum_is_the_headline_of_scenarios_that_know_it():
+    """The oracle has a share of its own then, but is not what others could be better than."""
+    results = table(
+        recoveries("plain", "popl", [2.0]),
+        ("plain", "popl", "upper", "share_of_optimum", [0.6]),
+        ("plain", "popl", "lower", "share_of_optimum", [0.5]),
+        ("plain", "oracle", "upper", "share_of_optimum", [0.7]),
+        ("plain", "random", "upper", "share_of_optimum", [0.0]),
+        recoveries("base", "popl", [0.9]),
+    )
+    head, rows = recovery_table(SUITE, results)
+    assert head == ["scenario", "popl", "oracle (told the groups)"]
+    assert rows == [["plain", "0.50", "0.70"], ["base", "0.90", "–"]]
+    text = benchmark_markdown(SUITE, results, about={}, missing={}, figures=[])
+    assert "Share of optimum (recovery in base) of the group with the lowest, by method" in text
+
+
 def test_what_a_set_holds_and_how_much_of_it_is_found():
     """Seed 0: gaps of 1.0 - 0.9 and 0.8 - 0.75, at 10 answers 0.3 and 0.05. Seed 1: 0 and 0.2, and
     0.1 and 0.1. The largest are 0.1 and 0.2; 0.3 and 0.1. The best in hindsight of the worst group:

@@ -89,6 +89,17 @@ def test_the_report_has_everything() -> None:
     assert text.endswith(".\n")
 
 
+def test_the_share_of_optimum_takes_the_place_of_recovery_where_it_is_known() -> None:
+    shares = RESULTS[RESULTS["measure"] == "recovery"].assign(measure="share_of_optimum")
+    results = pd.concat([RESULTS, shares])
+    assert printed(results)[0] == [
+        *("method", "raters who want", "return", "share of optimum", "success", "accuracy")
+    ]
+    text = markdown(results, title="t", about={}, figures=[])
+    worst = "Share of optimum of the worst-served group: POPL (catered) **0.00**, "
+    assert f"{worst}CPL on everybody's answers **0.30**, oracle (told the groups) **1.00**." in text
+
+
 def test_the_report_does_without_baselines_and_pictures() -> None:
     results = RESULTS[RESULTS["measure"] == "accuracy"]
     text = markdown(results, title="t", about={}, figures=[])
