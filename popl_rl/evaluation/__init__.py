@@ -1,7 +1,7 @@
 """Evaluation of what was learnt, by what every hidden group of raters wants.
 
 - What hypotheses do: ``acting`` rolls policies out, plans for reward functions or chooses items;
-  ``ppo`` trains policies on reward functions.
+  ``ppo`` trains policies on reward functions, with episodes from ``ppo_episodes``.
 - What that is worth: ``measures`` of episodes and rankings, ``optimum`` with exact returns,
   ``best_of_set``, ``held_out_raters`` and ``ranking_agreement``.
 - What is told: ``evaluator`` fills the ``results`` of a run, ``diagnostics`` puts into words what

@@ -397,5 +397,4 @@ class Evaluator:
                 rows.add(entry, index, chosen, torch.ones(1))
                 rows.add_accuracy(entry, index, catered=value, best=value)
         for kind, model in reward_baselines.dpl.items():
-            context = model.hidden_context(self.bank)
-            rows.add_whole((f"dpl_{kind}", ""), "hidden_context", context)
+            rows.add_whole((f"dpl_{kind}", ""), "hidden_context", model.hidden_context(self.bank))

@@ -114,7 +114,7 @@ def test_an_environment_that_counts_from_0(source):
     ids=["policies", "planned rewards", "optimised rewards"],
 )
 def test_where_actions_begin_changes_no_result(results, overrides, tmp_path):
-    quick = ["evaluation.ppo_frames=200", "evaluation.baseline_steps=20", *overrides]
+    quick = ["evaluation.ppo_frames=200", "method.training.steps=20", *overrides]
     one = results("zero", *quick)
     other = results("one", "+env.options.first=1", *quick)
     pd.testing.assert_frame_equal(one, other, check_exact=True)
