@@ -9,29 +9,23 @@ raters.
 """
 
 import copy
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal, Self
+from typing import Any
 
 import torch
-import torch.nn.functional as F  # noqa: N812 - the name everyone knows
-from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from popl_rl.algorithms.losses import cpl_loss
 from popl_rl.algorithms.problem import Problem
 from popl_rl.config import VPLSettings
-from popl_rl.data.bank import SegmentBank
-from popl_rl.data.comparisons import Comparisons
-from popl_rl.models.hypothesis_set import Catered
+from popl_rl.models.encoded_policy_set import AnswerEncoder, EncodedPolicySet
 from popl_rl.models.policies import PolicySpec, build_network
-from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.population import Population
 from popl_rl.models.schedules import linear_decay
 from popl_rl.models.scoring import case_values, rater_accuracy
 from popl_rl.selection.farthest_first import farthest_first
 
-__all__ = ["VPL", "AnswerEncoder", "EncodedPolicySet", "divergence", "spread_points"]
+__all__ = ["VPL", "divergence", "spread_points"]
 
 _MOST = 64  # policies in the set
 
@@ -58,137 +52,6 @@ def spread_points(points: Tensor, count: int) -> Tensor:
         first=int((points - points.mean(0)).norm(dim=1).argmax()),
         device=points.device,
     )
-
-
-class AnswerEncoder(nn.Module):
-    """What a rater wants, as a belief ``N(mean, std)`` about z, from any number of answers.
-
-    Steps are embedded and averaged over a segment, the two segments of an answer are joined, and
-    answers are embedded and averaged: neither the order of answers nor their number matters.
-
-    Args:
-        spec: Sizes of observations and actions.
-        latent: Length L of z.
-        units: Units of each hidden layer.
-        generator: Source of the initial weights.
-    """
-
-    def __init__(
-        self, spec: PolicySpec, latent: int, *, units: int = 64, generator: torch.Generator
-    ) -> None:
-        super().__init__()
-        self.spec = spec
-        wide = spec.observation_dim + spec.action_dim
-        # Networks of these sizes; what their outputs mean is our affair.
-        layers = [
-            build_network(PolicySpec(inputs, outputs, True, hidden), generator=generator)
-            for inputs, outputs, hidden in (
-                (wide, units, ()),
-                (2 * units, units, ()),
-                (units, 2 * latent, (units,)),
-            )
-        ]
-        self.step, self.answer, self.belief = layers
-
-    def segments(self, bank: SegmentBank, segment: Tensor) -> Tensor:
-        """Embedded segments, ``[...]`` -> ``[..., units]``."""
-        action = bank.action[segment]
-        if self.spec.discrete:
-            action = F.one_hot(action, self.spec.action_dim).float()
-        steps = torch.cat([bank.observation[bank.row[segment]], action], -1)
-        embedded: Tensor = self.step(steps).relu().mean(-2)
-        return embedded
-
-    def forward(self, bank: SegmentBank, preferred: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
-        """The belief about raters.
-
-        Args:
-            bank: What the answers are about.
-            preferred: Segments that each of B raters preferred, ``[B, K]``.
-            other: Segments that they preferred these to, ``[B, K]``.
-
-        Returns:
-            Mean and log standard deviation, each ``[B, L]``.
-        """
-        pair = torch.cat([self.segments(bank, preferred), self.segments(bank, other)], -1)
-        mean, log_std = self.belief(self.answer(pair).relu().mean(-2)).chunk(2, -1)
-        return mean, log_std.clamp(-5, 2)
-
-
-class EncodedPolicySet(PolicySet):
-    """Policies for different z, of which a new rater is given the one that an encoder believes in.
-
-    What :meth:`save` writes is a :class:`PolicySet`, without the encoder: once loaded, new raters
-    are catered to by how well the policies explain their answers, as any set does.
-
-    Args:
-        population: N policies.
-        encoder: Tells what a rater wants.
-        z: For which z the policies are, ``[N, L]``.
-        alpha: Scale of their scores, as trained.
-        discount: Per-step discount of their scores.
-    """
-
-    def __init__(
-        self,
-        population: Population,
-        *,
-        encoder: AnswerEncoder,
-        z: Tensor,
-        alpha: float = 0.5,
-        discount: float = 1.0,
-    ) -> None:
-        super().__init__(population, alpha=alpha, discount=discount)
-        self.encoder = encoder
-        self.z = z
-
-    @torch.no_grad()
-    def cater(
-        self,
-        segments: TensorDictBase | SegmentBank,
-        answers: TensorDictBase,
-        *,
-        method: Literal["posterior", "lexicase"] = "posterior",
-        mistake: float = 0.05,
-        generator: torch.Generator | None = None,
-    ) -> Catered:
-        """Choose a policy for one rater from a few answers.
-
-        Args:
-            segments: What the answers are about.
-            answers: TensorDict ``[K]`` with ``pair`` and ``answer``; ties and skips are ignored.
-            method: ``"posterior"``: belief ``w_n ~ q(z_n | answers)`` of the encoder, and the one
-                believed in most, the nearest in units of the encoder's standard deviations.
-                ``"lexicase"``: as :meth:`PolicySet.cater`.
-            mistake: Not used.
-            generator: Source of the lexicase draw.
-
-        Raises:
-            ValueError: If no answer is strict, or the arguments are off.
-        """
-        if method != "posterior":
-            return super().cater(
-                segments, answers, method=method, mistake=mistake, generator=generator
-            )
-        comparisons = Comparisons.from_preferences(answers, cases="preference")
-        device = self.population.device
-        bank = segments if isinstance(segments, SegmentBank) else self._bank(segments)
-        said = comparisons.to(device)
-        mean, log_std = self.encoder(bank.to(device), said.preferred[None], said.other[None])
-        distance = ((self.z - mean) / log_std.exp()).square().sum(1).cpu()
-        return Catered(int(distance.argmin()), (-distance / 2).softmax(0))
-
-    def subset(self, members: Sequence[int]) -> Self:
-        """Some of them, in the given order."""
-        chosen = type(self)(
-            self.population.subset(members),
-            encoder=self.encoder,
-            z=self.z[torch.as_tensor(members)],
-            alpha=self.alpha,
-            discount=self.discount,
-        )
-        chosen.origin = [self.origin[member] for member in members]
-        return chosen
 
 
 class VPL:

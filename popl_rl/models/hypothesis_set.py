@@ -191,7 +191,28 @@ class HypothesisSet:
         }
         with written_beside(Path(path)) as beside:
             save_tensordict(population.members.data, beside / "members")
+            self._write_more(beside)
             (beside / f"{self._kind}_set.json").write_text(json.dumps(about))
+
+    def _write_more(self, folder: Path) -> None:
+        """Write what this kind of set keeps beside its members."""
+
+    @classmethod
+    def _assemble(
+        cls,
+        population: Population,
+        path: Path,  # noqa: ARG003 - for kinds that keep more
+        *,
+        alpha: float,
+        discount: float,
+    ) -> Self:
+        """A set of these members, with what :meth:`_write_more` wrote at ``path``."""
+        return cls(population, alpha=alpha, discount=discount)
+
+    @classmethod
+    def is_at(cls, path: Path | str) -> bool:
+        """Whether a set of this very kind was saved at ``path``."""
+        return (Path(path) / f"{cls._kind}_set.json").is_file()
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
@@ -204,9 +225,11 @@ class HypothesisSet:
         path = Path(path)
         about_path = path / f"{cls._kind}_set.json"
         if not about_path.is_file():
+            others = [other.stem for other in path.glob("*_set.json")]
+            cure = f"it holds {others[0]}.json: read it with load_set()" if others else ""
             raise FileNotFoundError(
                 f"no {cls._kind} set at {path}: expected the folder {cls.folder!r} of a finished "
-                "run"
+                f"run{'; ' * bool(cure)}{cure}"
             )
         try:
             about = json.loads(about_path.read_text())
@@ -228,7 +251,8 @@ class HypothesisSet:
                 if members[key].shape != expected[key].shape:
                     raise ValueError(f"{key} has shape {tuple(members[key].shape)}")
             expected.update_(members)
-            loaded = cls(population, alpha=float(about["alpha"]), discount=float(about["discount"]))
+            scale = {name: float(about[name]) for name in ("alpha", "discount")}
+            loaded = cls._assemble(population, path, **scale)
             loaded.origin = [int(member) for member in about["origin"]]
         except (
             AttributeError,

@@ -6,14 +6,16 @@ import pytest
 import torch
 
 from popl_rl.algorithms.problem import Problem
-from popl_rl.algorithms.vpl import VPL, AnswerEncoder, EncodedPolicySet, divergence, spread_points
+from popl_rl.algorithms.vpl import VPL, divergence, spread_points
 from popl_rl.config import Training, VPLSettings
 from popl_rl.data.bank import SegmentBank
 from popl_rl.keys import ANSWER, PAIR, RATER
+from popl_rl.models.encoded_policy_set import AnswerEncoder, EncodedPolicySet
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.models.scoring import case_values, margins, segment_scores
+from popl_rl.models.sets import load_set
 
 SPEC = PolicySpec(5, 2, True, (6,))
 CONTINUOUS = PolicySpec(3, 2, False, (6, 6))
@@ -196,20 +198,20 @@ def test_the_set_is_bounded_and_part_of_it_can_be_taken(monkeypatch, trained, ba
     assert part.cater(bank, answers_of(preferences, 0)).member in (0, 1)
 
 
-def test_what_is_saved_is_a_plain_set_that_caters_by_the_answers(
-    trained, tmp_path, bank, preferences, comparisons
-):
+def test_a_saved_set_keeps_its_encoder(trained, tmp_path, bank, preferences):
+    """Loaded again it gives every rater the same policy, with the same belief."""
     found = trained.result()
     found.save(tmp_path / "policies")
-    loaded = PolicySet.load(tmp_path / "policies")
-    assert type(loaded) is PolicySet
-    assert len(loaded) == len(found)
-    values = case_values(
-        margins(loaded.population, bank, comparisons, alpha=loaded.alpha) > 0, comparisons
-    )
+    loaded = load_set(tmp_path / "policies")
+    assert type(loaded) is EncodedPolicySet
+    assert torch.equal(loaded.z, found.z)
     for rater in range(8):
-        member = loaded.cater(bank, answers_of(preferences, rater)).member
-        assert float(values[member, rater]) > 0.7
+        said = answers_of(preferences, rater)
+        one, other = found.cater(bank, said), loaded.cater(bank, said)
+        assert one.member == other.member
+        assert torch.equal(one.weights, other.weights)
+    with pytest.raises(FileNotFoundError, match=r"encoded_policy_set.json: read it with load_set"):
+        PolicySet.load(tmp_path / "policies")
 
 
 def test_the_seed_decides_everything(bank, comparisons):

@@ -7,8 +7,8 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from popl_rl.algorithms.vpl import EncodedPolicySet
 from popl_rl.evaluation.statistics import RESULT_COLUMNS, read_results
+from popl_rl.models.encoded_policy_set import EncodedPolicySet
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.population import Population
