@@ -16,7 +16,7 @@ from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from popl_rl.config import validate
+from popl_rl.config import plain, validate
 from popl_rl.experiments.cells import Cell, is_finished
 from popl_rl.storage import write_json
 from popl_rl.trainers import train_popl
@@ -122,8 +122,8 @@ def _train(task: Task) -> None:
 def _resume(config: Any, folder: Path) -> bool:
     """Finish what a killed process has left, if that is the same run; whether it worked."""
     stored = folder / "config.yaml"
-    same = stored.is_file() and stored.read_text("utf-8") == OmegaConf.to_yaml(config, resolve=True)
-    if not same:
+    wanted = OmegaConf.to_yaml(OmegaConf.structured(plain(config)), resolve=True)
+    if not stored.is_file() or stored.read_text("utf-8") != wanted:
         return False
     again = copy.deepcopy(config)
     again.resume = str(folder)

@@ -1,4 +1,4 @@
-"""A set of policies for different z, with the encoder that tells which z a new rater wants (VPL)."""
+"""Policies for different z, with the encoder that tells which z a new rater wants (VPL)."""
 
 from collections.abc import Sequence
 from pathlib import Path

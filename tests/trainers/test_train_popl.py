@@ -220,7 +220,7 @@ def test_methods_to_compare_with(train, method, label, found):
     assert report.startswith("# POPL: ") == (label == "popl")
     pictures = {path.stem for path in (result.run_dir / "figures").iterdir()}
     assert {"learning", "members", "occupancy"} <= pictures
-    assert ("selection" in pictures) == label.startswith("popl")
+    assert ("selection" in pictures) == method.startswith("popl")
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
