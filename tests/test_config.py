@@ -99,7 +99,9 @@ CASES = [
     ("raters__response__tie", -0.1, "raters.response.tie must be at least 0, got -0.1"),
     ("data__segments", 1, "data.segments must be at least 2, to compare, got 1"),
     ("data__load", "/no/such/run/data",
-     "data.load must be the folder 'data' of an earlier run, got '/no/such/run/data'"),
+     "data.load must be the folder 'data' of an earlier run, or other data with data.reader, got "
+     "'/no/such/run/data'"),
+    ("data__reader", "my.py:read", "data.reader must be null without data.load, got 'my.py:read'"),
     ("method__factory", "", "method.factory must be a reference of a method, got ''"),
     ("method__reads", ["training", "magic"],
      "method.reads must be sections out of training, popl, refinement, mixture, clone, em, vpl, "

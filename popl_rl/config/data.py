@@ -90,6 +90,7 @@ class DataConfig:
     length: int = 12  # steps of a segment
     memmap: str | None = None  # folder for memory-mapped storage; in memory if null
     load: str | None = None  # folder 'data' of an earlier run: its segments and preferences
+    reader: str | None = None  # reference of kind reader, for other data in load; null for a folder
     save: bool = True  # keep segments and preferences in the run folder
     store: str | None = None  # folder in which segments are kept for other runs; none if null
     seed: int | None = None  # of the segments; that of the run if null
@@ -99,5 +100,10 @@ class DataConfig:
         at.at_least_one(self, "length")
         at.expect(self.segments >= 2, "segments", "at least 2, to compare", self.segments)
         if self.load is not None:
+            folder = "the folder 'data' of an earlier run, or other data with data.reader"
             found = (Path(self.load) / "segments").is_dir()
-            at.expect(found, "load", "the folder 'data' of an earlier run", self.load)
+            if self.reader is not None:
+                folder, found = "something that the reader can read", Path(self.load).exists()
+            at.expect(found, "load", folder, self.load)
+        given = self.load is not None or self.reader is None
+        at.expect(given, "reader", "null without data.load", self.reader)

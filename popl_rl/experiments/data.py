@@ -19,7 +19,7 @@ from popl_rl.data.segments import collect_segments, segment_buffer, stored_segme
 from popl_rl.data.store import store_path, stored
 from popl_rl.keys import ACTION, GROUP, INFO, OBSERVATION
 from popl_rl.randomness import stream
-from popl_rl.raters.collector import collect_preferences, load_preferences
+from popl_rl.raters.collector import check_preferences, collect_preferences, load_preferences
 from popl_rl.raters.groups import RaterGroup, make_groups
 from popl_rl.raters.pairs import training_pool
 from popl_rl.raters.people import Raters
@@ -27,7 +27,11 @@ from popl_rl.raters.response import Response
 from popl_rl.raters.values import with_values
 from popl_rl.storage import load_tensordict, save_tensordict, write_json
 
-__all__ = ["Data", "build_groups", "describe", "fresh_segments", "make_data"]
+__all__ = ["Data", "Reader", "build_groups", "describe", "fresh_segments", "make_data"]
+
+#: Reads other people's data: path -> segments ``[N, T]`` with ``observation`` and ``action``, and
+#: preferences ``[M]`` with ``pair``, ``answer`` and ``rater``.
+Reader = Callable[[Path], tuple[TensorDictBase, TensorDict]]
 
 #: Beside saved preferences: names of the groups.
 _ABOUT = "about.json"
@@ -121,6 +125,7 @@ def make_data(
     seed: int,
     env: EnvConfig,
     load: Path | None = None,
+    reader: Reader | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Data:
     """Collect segments and ask the raters, or load what an earlier run collected.
@@ -133,6 +138,7 @@ def make_data(
         seed: Seed of the run.
         env: What the world was built from.
         load: Folder to load from instead.
+        reader: Reads ``load`` if it is no such folder.
         progress: Called with the number of segments collected so far.
 
     Raises:
@@ -140,8 +146,11 @@ def make_data(
             other groups were asked, or in another order, than ``groups``.
     """
     data_seed = seed if config.seed is None else config.seed
+    read = None if reader is None or load is None else _read(reader, load, config, world)
     source, folder = None, None if load is None else load / "segments"
-    if load is None:
+    if read is not None:
+        segments, folder = read[0], None
+    elif load is None:
 
         def collect() -> TensorDictBase:
             return _collect(config, world, env, stream(data_seed, "segments"), progress)
@@ -165,7 +174,9 @@ def make_data(
         groups = with_values(groups, segments, generator=stream(data_seed, "values"))
     segment_utility = torch.stack([group.segment_utility(segments) for group in groups])
     names = tuple(group.name for group in groups)
-    if load is None:
+    if read is not None:
+        preferences = read[1]
+    elif load is None:
         generator = stream(seed, "raters")
         people = Raters.draw(
             groups, num_raters=raters.count, shares=raters.shares, generator=generator
@@ -219,21 +230,35 @@ def _check_groups(load: Path, names: tuple[str, ...], *, numbered: int) -> None:
     )
 
 
+def _read(
+    reader: Reader, path: Path, config: DataConfig, world: World
+) -> tuple[TensorDictBase, TensorDict]:
+    """Other people's segments and preferences, checked as ours are."""
+    segments, preferences = reader(path)
+    _check_segments(segments, path, config, world)
+    check_preferences(preferences, path, num_segments=len(segments))
+    return segments, preferences
+
+
 def _load(path: Path, config: DataConfig, world: World) -> TensorDictBase:
     segments = load_tensordict(path, required={OBSERVATION: 3, ACTION: 2, INFO: 0})
+    _check_segments(segments, path.parent, config, world)
+    segments.auto_batch_size_(2)
+    return segments
+
+
+def _check_segments(segments: TensorDictBase, path: Path, config: DataConfig, world: World) -> None:
     if len(segments) < config.segments:
         raise ValueError(
-            f"data.segments asks for {config.segments} segments, but {path.parent} holds "
+            f"data.segments asks for {config.segments} segments, but {path} holds "
             f"{len(segments)}; ask for fewer or collect more"
         )
     expected = world.env.observation_space.shape
     if segments[OBSERVATION].shape[2:] != expected:
         raise ValueError(
-            f"{path.parent} holds observations of shape {tuple(segments[OBSERVATION].shape[2:])}, "
+            f"{path} holds observations of shape {tuple(segments[OBSERVATION].shape[2:])}, "
             f"but the environment gives {expected}; it was collected in another environment"
         )
-    segments.auto_batch_size_(2)
-    return segments
 
 
 def fresh_segments(

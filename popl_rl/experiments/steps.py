@@ -27,7 +27,7 @@ from popl_rl.experiments.builders import (
     build_spec,
     train_baselines,
 )
-from popl_rl.experiments.data import Data, build_groups, make_data
+from popl_rl.experiments.data import Data, Reader, build_groups, make_data
 from popl_rl.experiments.evaluators import make_evaluator
 from popl_rl.experiments.loggers import Progress, RunLogger, make_logger
 from popl_rl.experiments.metrics import MetricsWriter
@@ -44,6 +44,7 @@ from popl_rl.models.sets import as_set
 from popl_rl.models.style_population import StyledPopulation
 from popl_rl.randomness import stream
 from popl_rl.raters.groups import RaterGroup
+from popl_rl.registry import resolve
 from popl_rl.storage import write_atomic
 
 __all__ = [
@@ -123,8 +124,11 @@ def gather(config: Config, run_dir: Path) -> Setting:
     groups = build_groups(config.raters, world)
     kept = run_dir / "data"
     load = kept if (kept / "preferences").is_dir() else None
+    reader = None
     if load is None and config.data.load is not None:
         load = Path(config.data.load)
+        if config.data.reader is not None:
+            reader = cast("Reader", resolve("reader", config.data.reader))
     with Progress("segments", total=config.data.segments) as progress:
         data = make_data(
             config.data,
@@ -134,6 +138,7 @@ def gather(config: Config, run_dir: Path) -> Setting:
             seed=config.seed,
             env=config.env,
             load=load,
+            reader=reader,
             progress=progress.update,
         )
     if config.data.save:

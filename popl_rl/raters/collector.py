@@ -14,7 +14,7 @@ from popl_rl.raters.pairs import PairPool, starts_of
 from popl_rl.raters.people import Raters
 from popl_rl.storage import load_tensordict
 
-__all__ = ["PreferenceCollector", "collect_preferences", "load_preferences"]
+__all__ = ["PreferenceCollector", "check_preferences", "collect_preferences", "load_preferences"]
 
 
 class PreferenceCollector(Transform):
@@ -134,6 +134,23 @@ def load_preferences(path: Path, *, num_segments: int) -> TensorDict:
         ValueError: If it is damaged, foreign, or refers to segments that do not exist.
     """
     data = load_tensordict(path, required={PAIR: 2, ANSWER: 1, RATER: 1})
+    return check_preferences(data, path, num_segments=num_segments)
+
+
+def check_preferences(data: TensorDict, path: Path, *, num_segments: int) -> TensorDict:
+    """Check that preferences belong to the segments at hand.
+
+    Args:
+        data: TensorDict ``[M]`` with ``pair`` and ``answer``.
+        path: Where they are from, for the message.
+        num_segments: Number of segments N.
+
+    Returns:
+        The same preferences.
+
+    Raises:
+        ValueError: If they are damaged, foreign, or refer to segments that do not exist.
+    """
     pair, answer = data[PAIR], data[ANSWER]
     if pair.dtype != torch.int64 or pair.shape != (len(answer), 2) or not len(pair):
         raise ValueError(
