@@ -88,7 +88,11 @@ register_schemas()
 @hydra.main(version_base="1.3", config_path="pkg://popl_rl.configs", config_name="train")
 def main(cfg: Any) -> None:
     """Hydra's entry."""
-    show(run(cfg))
+    config = prepare(cfg)
+    method, env = config.method.name, config.env.factory
+    # Loading PyTorch takes seconds, in which a person should know that something goes on.
+    sys.stderr.write(f"{method} in {env}, seed {config.seed}: loading PyTorch\n")
+    show(run(config))
 
 
 def cli() -> None:
