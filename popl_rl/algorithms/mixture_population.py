@@ -31,6 +31,7 @@ from popl_rl.data.bank import SegmentBank
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.policies import Spec
 from popl_rl.models.population import Population
+from popl_rl.models.preference_likelihood import log_likelihood
 from popl_rl.models.schedules import linear_decay
 from popl_rl.selection.lexicase import lexicase_report
 from popl_rl.selection.mad import mad
@@ -74,7 +75,11 @@ class MixturePOPL:
         select: Selection | None = None,
         generator: torch.Generator,
     ) -> None:
-        self.problem, self.settings = problem, settings
+        # Slips of single answers would dissolve the mixtures: they are left out to the end.
+        final = replace(problem.training, slip=settings.slip)
+        search = replace(final, alpha=settings.alpha, conservatism=settings.conservatism)
+        self.problem, self.settings = replace(problem, training=final), settings
+        problem = replace(problem, training=search)
         self.select, self.generator = select, generator
         self.generation, self.generations = 0, settings.generations
         self._counts = _visit_counts(problem.bank, problem.spec, problem.training.discount)
@@ -97,7 +102,7 @@ class MixturePOPL:
         self.share = self.active / taken
         count = settings.mixtures * places
         self.population = Population.create(problem.spec, count, generator=generator).to(device)
-        self.loss, self.optimizer = self._trainer(self.population)
+        self.loss, self.optimizer = _trainer(problem, self.population)
 
     def step(self) -> dict[str, float]:
         """Run one generation.
@@ -181,7 +186,7 @@ class MixturePOPL:
         fold = self._permutation(count) % settings.folds
         row = torch.arange(count, device=fold.device)
         copies = members.subset(list(range(size)) * (settings.folds + 1))
-        loss, optimizer = self._trainer(copies)
+        loss, optimizer = _trainer(self.problem, copies)
         blocks = -(-settings.final_steps // _FINAL_BLOCK)
         schedule = linear_decay(optimizer, blocks)
         use = torch.ones(settings.folds + 1, count, device=fold.device)
@@ -189,7 +194,7 @@ class MixturePOPL:
         use = use * count / use.sum(1, keepdim=True)
         shares = share.expand(settings.folds + 1, -1)
         for _ in range(blocks):
-            likelihood = self._likelihood(self.problem, copies)
+            likelihood = self._likelihood(self.problem.margins(copies))
             belongs = expect(likelihood.unflatten(0, (settings.folds + 1, size)), shares)
             responsibility = belongs.responsibility[fold, :, row].T
             for _ in range(_FINAL_BLOCK):
@@ -202,17 +207,15 @@ class MixturePOPL:
             schedule.step()
         return copies.subset(list(range(settings.folds * size, len(copies))))
 
-    @staticmethod
-    def _likelihood(problem: Problem, population: Population) -> Tensor:
-        """Log-likelihood of the answers of a problem under every member, ``[N, M]``."""
-        return problem.likelihood(problem.scores(population))
-
     def _held_out(self) -> tuple[Tensor, Tensor]:
         """Passes ``[N, H]`` and robust log-likelihoods ``[mixtures, H]`` of what is held out."""
-        scores, held = self.held.scores(self.population), self.held.comparisons
-        passes = scores[:, held.preferred] > scores[:, held.other]
-        likelihood = self._expect(self.held.likelihood(scores)).evidence.exp()
-        return passes, (_OUTLIERS + (1 - 2 * _OUTLIERS) * likelihood).log()
+        margin = self.held.margins(self.population)
+        likelihood = self._expect(self._likelihood(margin)).evidence.exp()
+        return margin > 0, (_OUTLIERS + (1 - 2 * _OUTLIERS) * likelihood).log()
+
+    def _likelihood(self, margin: Tensor) -> Tensor:
+        """Log-likelihood of answers with these margins, without any conservatism, ``[N, M]``."""
+        return log_likelihood(margin, self.settings.slip)
 
     def _expect(self, likelihood: Tensor) -> Expectation:
         """E-step of every mixture; each preference is a case of its own."""
@@ -221,7 +224,7 @@ class MixturePOPL:
 
     def _responsibility(self) -> Tensor:
         """Whom each member speaks for, ``[N, M]``; shares become its means."""
-        belongs = self._expect(self._likelihood(self.train, self.population)).responsibility
+        belongs = self._expect(self._likelihood(self.train.margins(self.population))).responsibility
         self.share = belongs.mean(2)
         return belongs.flatten(0, 1)
 
@@ -253,12 +256,6 @@ class MixturePOPL:
         self.active, self.share = active, share / share.sum(1, keepdim=True)
         self.population.replace_(source.flatten())
         inherit_moments(self.optimizer, source.flatten())
-
-    def _trainer(self, population: Population) -> tuple[CPLLoss, torch.optim.Adam]:
-        rate = self.problem.training.learning_rate
-        return self.problem.loss(population), torch.optim.Adam(
-            population.members.parameters(), lr=rate
-        )
 
     def _shared_losses(self, loss: CPLLoss, index: Tensor) -> Tensor:
         """Losses of every member on one shared batch, ``[N, B]``."""
@@ -304,6 +301,11 @@ class MixturePOPL:
         self.active, self.share = state["active"].clone(), state["share"].clone()
         self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
         self.generator.set_state(state["generator"].cpu())
+
+
+def _trainer(problem: Problem, population: Population) -> tuple[CPLLoss, torch.optim.Adam]:
+    rate = problem.training.learning_rate
+    return problem.loss(population), torch.optim.Adam(population.members.parameters(), lr=rate)
 
 
 def _visit_counts(bank: SegmentBank, spec: Spec, discount: float) -> Tensor | None:

@@ -95,6 +95,9 @@ class MixtureSettings:
     held_out: float = 0.2  # share of the preferences that only selection sees
     bundle: int = 20  # held-out preferences of a lexicase case
     first_selection: int = 14  # generation after which selection begins
+    alpha: float = 0.5  # scale of the scores until the final training, which has the recipe's
+    conservatism: float = 0.9  # lambda of the CPL loss until then
+    slip: float = 0.0  # chance of a slip: of one answer it cannot be told from another group's wish
     exchange: float = 0.15  # chance that a further child swaps a member with another mixture
     removal: float = 0.15  # chance that a further child loses a member
     final_steps: int = 1000  # CPL steps of the final, cross-fitted training
@@ -106,6 +109,9 @@ class MixtureSettings:
         names = ("mixtures", "generations", "steps", "block", "bundle", "first_selection")
         at.at_least_one(self, *names, "final_steps", "final_batch_size")
         at.expect(self.folds >= 2, "folds", "at least 2", self.folds)
+        at.positive(self, "alpha")
+        at.share(self, "conservatism")
+        at.expect(0 <= self.slip < 0.5, "slip", "in [0, 0.5)", self.slip)
         for name in ("held_out", "exchange", "removal"):
             value = getattr(self, name)
             at.expect(0 <= value < 1, name, "in [0, 1)", value)

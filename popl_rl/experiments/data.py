@@ -190,9 +190,8 @@ def make_data(
         )[:].exclude("index")
     else:
         preferences = load_preferences(load / "preferences", num_segments=len(segments))
-        group = preferences.get(GROUP, None)
-        if group is not None:
-            _check_groups(load, names, numbered=1 + int(group.max()))
+        if GROUP in preferences.keys(True):
+            _check_groups(load, names, numbered=1 + int(preferences[GROUP].max()))
     return Data(buffer, preferences, segment_utility, source, names)
 
 
