@@ -96,6 +96,9 @@ def test_curves_of_catering_and_the_best_in_hindsight():
 def test_curves_need_curves():
     with pytest.raises(ValueError, match="measures such as recovery@10, got none"):
         catering_curves(SUITE, CURVES[CURVES.method == "pooled_cpl"])
+    # As with evaluation.curve=[], where the best member alone is known.
+    with pytest.raises(ValueError, match="measures such as recovery@10, got none"):
+        catering_curves(SUITE, CURVES[CURVES.measure.str.startswith("best_")])
 
 
 RECOVERIES = table(
