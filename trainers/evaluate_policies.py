@@ -10,7 +10,6 @@ popl-evaluate run_dir=runs/<name> evaluation.answers=5    # cater from five answ
 popl-evaluate run_dir=runs/<name> seed=1 evaluation.episodes=1000
 """
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ from popl_rl.experiments.run_folder import load_config, save_config
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.reward_set import RewardSet
 from popl_rl.models.sets import load_set
-from popl_rl.storage import write_atomic
+from popl_rl.storage import write_atomic, written_beside
 from popl_rl.trainers.command import register_schemas, run_command
 
 
@@ -67,12 +66,7 @@ def run(config: EvaluateConfig) -> tuple[Path, Scoreboard]:
     board = evaluator.score(found, baselines, label=stored.method.name)
     number = 1 + len(list((run_dir / "evaluations").glob("[0-9]*")))
     folder = run_dir / "evaluations" / f"{number:03d}"
-    beside = folder.with_name(f".{folder.name}")
-    shutil.rmtree(beside, ignore_errors=True)
-    beside.mkdir(parents=True)
     used = {"run_dir": str(config.run_dir), "evaluation": stored.evaluation, "seed": seed}
-    save_config(beside, used)
-    write_atomic(beside / "results.csv", board.results.to_csv(index=False))
     title = f"Evaluation {number} of {run_dir.name}"
     about = {
         "answers of each new rater": stored.evaluation.answers,
@@ -80,8 +74,10 @@ def run(config: EvaluateConfig) -> tuple[Path, Scoreboard]:
         **diagnostics(board, evaluator),
     }
     report = markdown(board.results, title=title, about=about, figures=[])
-    write_atomic(beside / "report.md", report)
-    beside.rename(folder)
+    with written_beside(folder) as beside:
+        save_config(beside, used)
+        write_atomic(beside / "results.csv", board.results.to_csv(index=False))
+        write_atomic(beside / "report.md", report)
     return folder, board
 
 
