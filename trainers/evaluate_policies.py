@@ -19,11 +19,10 @@ from omegaconf import OmegaConf
 from rich.console import Console
 
 from popl_rl.config import Config, EvaluateConfig, validate
-from popl_rl.data.environments import build_world
 from popl_rl.evaluation.diagnostics import alarm, diagnostics
 from popl_rl.evaluation.results import Scoreboard
 from popl_rl.experiments.builders import build_spec
-from popl_rl.experiments.data import build_groups, make_data
+from popl_rl.experiments.data import build_groups, build_world, make_data
 from popl_rl.experiments.evaluators import make_evaluator
 from popl_rl.experiments.report import markdown, results_table
 from popl_rl.experiments.run_folder import load_config, save_config

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
 from popl_rl.config import DataConfig, EnvConfig, RatersConfig
-from popl_rl.data.environments import World
+from popl_rl.data.environments import World, make_world
 from popl_rl.data.segments import collect_segments, segment_buffer, stored_segments
 from popl_rl.data.store import store_path, stored
 from popl_rl.keys import ACTION, GROUP, INFO, OBSERVATION
@@ -27,7 +27,15 @@ from popl_rl.raters.response import Response
 from popl_rl.raters.values import with_values
 from popl_rl.storage import load_tensordict, save_tensordict, write_json
 
-__all__ = ["Data", "Reader", "build_groups", "describe", "fresh_segments", "make_data"]
+__all__ = [
+    "Data",
+    "Reader",
+    "build_groups",
+    "build_world",
+    "describe",
+    "fresh_segments",
+    "make_data",
+]
 
 #: Reads other people's data: path -> segments ``[N, T]`` with ``observation`` and ``action``, and
 #: preferences ``[M]`` with ``pair``, ``answer`` and ``rater``.
@@ -35,6 +43,23 @@ Reader = Callable[[Path], tuple[TensorDictBase, TensorDict]]
 
 #: Beside saved preferences: names of the groups.
 _ABOUT = "about.json"
+
+
+def build_world(config: EnvConfig) -> World:
+    """The environment of a run, see :func:`~popl_rl.data.environments.make_world`.
+
+    Raises:
+        ValueError: If the environment cannot be resolved or built, or ``env.mixture`` names
+            behaviours that it does not have.
+        TypeError: If it has no behaviours and its actions cannot be drawn at random.
+    """
+    return make_world(
+        config.factory,
+        env_id=config.id,
+        options=config.options,
+        data_options=config.data_options,
+        mixture=config.mixture,
+    )
 
 
 def build_groups(config: RatersConfig, world: World) -> tuple[RaterGroup, ...]:

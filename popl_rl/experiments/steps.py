@@ -16,7 +16,7 @@ from popl_rl.algorithms.reward_baselines import RewardBaselines, train_reward_ba
 from popl_rl.algorithms.trainer import MethodTrainer
 from popl_rl.config import Config, plain, validate
 from popl_rl.data.comparisons import Comparisons
-from popl_rl.data.environments import World, build_world, indexed, is_stateless
+from popl_rl.data.environments import World, indexed, is_stateless
 from popl_rl.evaluation.diagnostics import diagnostics
 from popl_rl.evaluation.evaluator import Evaluator
 from popl_rl.evaluation.results import Scoreboard
@@ -27,7 +27,7 @@ from popl_rl.experiments.builders import (
     build_spec,
     train_baselines,
 )
-from popl_rl.experiments.data import Data, Reader, build_groups, make_data
+from popl_rl.experiments.data import Data, Reader, build_groups, build_world, make_data
 from popl_rl.experiments.evaluators import make_evaluator
 from popl_rl.experiments.loggers import Progress, RunLogger, make_logger
 from popl_rl.experiments.metrics import MetricsWriter
@@ -259,6 +259,7 @@ def evaluate(
 
 
 def draw(
+    config: Config,
     setting: Setting,
     found: HypothesisSet,
     references: References,
@@ -276,6 +277,7 @@ def draw(
         evaluator=setting.evaluator,
         world=setting.world,
         reward_baselines=references.rewards,
+        with_animations=config.evaluation.animate,
     )
 
 

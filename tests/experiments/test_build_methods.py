@@ -12,8 +12,7 @@ from popl_rl.config import (
 )
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
-from popl_rl.data.environments import build_world
-from popl_rl.experiments.data import build_groups, make_data
+from popl_rl.experiments.data import build_groups, build_world, make_data
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.randomness import stream

@@ -14,9 +14,8 @@ from popl_rl.config import (
     MethodConfig,
     RatersConfig,
 )
-from popl_rl.data.environments import build_world
 from popl_rl.experiments.builders import build_spec
-from popl_rl.experiments.data import build_groups, make_data
+from popl_rl.experiments.data import build_groups, build_world, make_data
 from popl_rl.experiments.evaluators import make_evaluator
 from popl_rl.keys import GROUP, PAIR
 from popl_rl.storage import save_tensordict

@@ -6,9 +6,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from popl_rl.config import EnvConfig
 from popl_rl.data.behaviours import random_behaviour, table_behaviour
-from popl_rl.data.environments import build_world, counting_from_zero, indexed
+from popl_rl.data.environments import counting_from_zero, indexed, make_world
 from popl_rl.storage import load_tensordict
 from popl_rl.testing import check_env, tiny_env
 from popl_rl.trainers import train_popl
@@ -100,7 +99,7 @@ def test_learners_count_actions_from_0(segments):
 
 
 def test_an_environment_that_counts_from_0(source):
-    world = build_world(EnvConfig(factory=f"{source}:Walk", options={"first": 1}))
+    world = make_world(f"{source}:Walk", options={"first": 1})
     env = counting_from_zero(world.make())
     assert env.action_space == gymnasium.spaces.Discrete(2)
     env.reset(seed=0)

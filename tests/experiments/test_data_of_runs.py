@@ -9,9 +9,9 @@ from popl_rl.config import (
     RatersConfig,
     ResponseConfig,
 )
-from popl_rl.data.environments import behaviour_shares, build_world
+from popl_rl.data.environments import behaviour_shares
 from popl_rl.data.segments import collect_segments
-from popl_rl.experiments.data import build_groups, make_data
+from popl_rl.experiments.data import build_groups, build_world, make_data
 from popl_rl.keys import ANSWER, GROUP, PAIR, RATER, UTILITY
 from popl_rl.models.policies import PolicySpec
 from popl_rl.randomness import stream
