@@ -8,11 +8,13 @@ from dataclasses import fields, is_dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from popl_rl.config import Config
 from popl_rl.experiments.tables import fill_tables, make_tables, read_tables
 from popl_rl.testing import check_env, check_rater
+from popl_rl.testing.command import main as check
 from popl_rl.trainers import train_popl
 
 ROOT = Path(__file__).parents[1]
@@ -182,6 +184,19 @@ def test_plug_ins_of_the_method_can_be_used(what, file, config_of, tiny, tmp_pat
     read = [o for o in tiny if what != "class NoisyLexicase" or not o.startswith(NOT_TRAINING)]
     result = train_popl.run(config_of(*read, *overrides, "run_dir=run"))
     assert len(result.policies) >= 1
+    [checked] = [command for command in LAUNCHED if file in command]
+    assert check(shlex.split(checked)[3:]) == 0
+
+
+def test_the_reader_shown_can_be_used(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("my_reader.py").write_text(block_with("popl_rl/README.md", "def read"))
+    rows = {"observation": (6, 12, 18), "goal": (6, 12)}
+    columns = {name: np.zeros(shape, dtype=np.float32) for name, shape in rows.items()}
+    columns |= {"action": np.ones((6, 12), int), "pair": np.arange(6).reshape(3, 2)}
+    np.savez("answers.npz", **columns, answer=np.array([0, 1, 3]), rater=np.array([0, 0, 7]))
+    [checked] = [command for command in LAUNCHED if "my_reader.py" in command]
+    assert check(shlex.split(checked)[3:]) == 0
 
 
 @pytest.mark.docs

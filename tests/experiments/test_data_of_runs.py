@@ -63,14 +63,14 @@ def test_a_world_offers_what_its_environment_has(world):
 
 WALK = """
 import torch
-from popl_rl.testing import _Walk
+from popl_rl.testing import tiny_env
 
 
 def go_right(step, generator):
     return torch.ones(step.batch_size, dtype=torch.long)
 
 
-class Walk(_Walk):
+class Walk(type(tiny_env())):
     def __init__(self, cells="few"):
         super().__init__(8)
         self.cells = cells
