@@ -25,6 +25,8 @@ from popl_rl.randomness import stream
 
 __all__ = ["Acting", "Choosing", "Optimising", "Planning", "Rolling", "plan"]
 
+_HIDDEN = (64, 64)  # units of the policies that PPO trains
+
 
 class Acting(Protocol):
     """Shows what hypotheses do."""
@@ -141,14 +143,14 @@ class Optimising(Rolling):
             return super().policies(hypotheses)
         trained = [self._policy(hypotheses, member) for member in range(len(hypotheses))]
         networks = [population.network(0) for population in trained]
-        return PolicySet(Population(networks, trained[0].spec))
+        return PolicySet(Population(networks, PolicySpec.from_env(self.world.env, hidden=_HIDDEN)))
 
     def _policy(self, rewards: RewardSet, member: int) -> Population:
         own = rewards.population.members.data[member].values(True, True)
         key = b"".join(value.cpu().numpy().tobytes() for value in own)
         if key not in self._trained:
             # PPO's policies choose actions as reward functions judge them: counted from 0.
-            spec = PolicySpec.from_env(self.world.env, hidden=(64, 64))
+            spec = PolicySpec.from_env(counting_from_zero(self.world.env), hidden=_HIDDEN)
             best = rewards.subset([member]).reward(self.bank.observation).max()
             reward = reward_of(rewards, member)
             self._trained[key] = train_ppo(
