@@ -78,7 +78,7 @@ def save_tensordict(data: TensorDictBase, path: Path) -> None:
 
 
 def load_tensordict(path: Path, *, required: Mapping[str, int] | None = None) -> TensorDict:
-    """Read what :func:`save_tensordict` wrote, into memory.
+    """Read what ``save_tensordict`` wrote, into memory.
 
     Args:
         path: Folder to read.
@@ -185,5 +185,5 @@ def write_atomic(path: Path, content: str | bytes) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file with :func:`write_atomic`."""
+    """Write a JSON file with ``write_atomic``."""
     write_atomic(path, json.dumps(value, indent=2) + "\n")

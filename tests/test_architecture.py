@@ -68,7 +68,7 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 
 def package_of(module):
-    """The package of :data:`ALLOWED` that a module belongs to."""
+    """The package of ``ALLOWED`` that a module belongs to."""
     parts = module.split(".")
     return parts[1] if len(parts) > 1 and parts[1] in ALLOWED else "root"
 

@@ -199,6 +199,18 @@ def test_the_reader_shown_can_be_used(tmp_path, monkeypatch):
     assert check(shlex.split(checked)[3:]) == 0
 
 
+def test_docstrings_name_things_as_the_reference_links_them():
+    """In backticks, with dots where they are elsewhere: pdoc shows Sphinx's roles as they stand."""
+    folders = ("popl_rl", "envs", "trainers", "configs", "tests")
+    paths = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
+    found = {
+        str(path.relative_to(ROOT)): re.findall(r":[a-z]+:`[^`]+`", path.read_text("utf-8"))
+        for path in paths
+        if path.name not in ("refinement.py", "mixture_population.py")
+    }
+    assert {path: roles for path, roles in found.items() if roles} == {}
+
+
 @pytest.mark.docs
 def test_the_reference_builds_without_warnings(tmp_path):
     [command] = [
@@ -218,6 +230,8 @@ def test_the_reference_builds_without_warnings(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "warn" not in done.stderr.lower(), done.stderr
     assert (tmp_path / "popl_rl" / "selection" / "lexicase.html").is_file()
+    shown = (tmp_path / "popl_rl" / "algorithms" / "trainer.html").read_text("utf-8")
+    assert 'href="popl.html#POPL.step"' in shown.replace("../algorithms/", "")
     # A package that is new must be named in the command too.
     packages = {path.parent.name for path in (ROOT / "popl_rl").glob("*/__init__.py")}
     assert packages <= {path.stem for path in (tmp_path / "popl_rl").glob("*.html")}

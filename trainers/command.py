@@ -21,7 +21,7 @@ USER_ERRORS = (HydraException, OmegaConfBaseException, ValueError, TypeError, OS
 
 
 def register_schemas() -> None:
-    """Make the dataclasses of :mod:`popl_rl.config` known to Hydra."""
+    """Make the dataclasses of ``popl_rl.config`` known to Hydra."""
     store = ConfigStore.instance()
     store.store(name="schema", node=Config)
     store.store(name="evaluate_schema", node=EvaluateConfig)

@@ -1,8 +1,8 @@
 """Environments as a run uses them, and what each offers beyond Gymnasium's interface.
 
 Where actions are ``Discrete(n, start)``, everything about an environment (its steps, its table, its
-behaviours, segments) has them from ``start`` on; :func:`indexed` and :func:`counting_from_zero` are
-the border to learners, who count them from 0.
+behaviours, segments) has them from ``start`` on; ``indexed`` and ``counting_from_zero`` are the
+border to learners, who count them from 0.
 """
 
 import fnmatch
@@ -90,22 +90,22 @@ def make_world(
     """Resolve an environment and read off what it offers.
 
     An environment is any Gymnasium environment. Three methods are used if it has them:
-    ``transition_table()`` (exact regret labels), ``behaviours()`` (what the data shows: by
-    name, tables ``[S, A]`` of action probabilities or functions; uniformly random otherwise), and
-    ``collect_segments(...)`` (see :class:`Collect`), which collects the data itself.
+    ``transition_table()`` (exact regret labels), ``behaviours()`` (what the data shows: by name,
+    tables ``[S, A]`` of action probabilities or functions; uniformly random otherwise), and
+    ``collect_segments(...)`` (see ``Collect``), which collects the data itself.
 
     Args:
         factory: Reference of kind ``env``.
         env_id: First argument of the factory, such as a Gymnasium id; None for none.
         options: Further arguments of the factory.
         data_options: What differs from these where segments are collected.
-        mixture: Shares of the behaviours, see :func:`behaviour_shares`.
+        mixture: Shares of the behaviours, see ``behaviour_shares``.
 
     Raises:
         ValueError: If the environment cannot be resolved or built, or ``mixture`` names behaviours
             that it does not have.
         TypeError: If it has no behaviours and its actions cannot be drawn at random, see
-            :func:`~popl_rl.data.behaviours.random_behaviour`.
+            ``popl_rl.data.behaviours.random_behaviour``.
     """
     make_env = cast("Callable[..., gymnasium.Env[Any, Any]]", resolve("env", factory))
     leading = () if env_id is None else (env_id,)

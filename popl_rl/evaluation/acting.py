@@ -54,7 +54,7 @@ class Rolling:
         self.greedy, self.seed = greedy, seed
 
     def __call__(self, hypotheses: HypothesisSet | None) -> TensorDict:
-        """See :class:`Acting`."""
+        """See ``Acting``."""
         return self._roll(self.policies(hypotheses))
 
     def policies(self, hypotheses: HypothesisSet | None) -> PolicySet | Tensor | None:
@@ -95,7 +95,7 @@ class Planning(Rolling):
     """
 
     def policies(self, hypotheses: HypothesisSet | None) -> PolicySet | Tensor | None:
-        """See :meth:`Rolling.policies`."""
+        """See ``Rolling.policies``."""
         if not isinstance(hypotheses, RewardSet):
             return super().policies(hypotheses)
         if self.world.table is None:
@@ -116,7 +116,7 @@ class Optimising(Rolling):
         greedy: Whether to take the most likely actions instead of sampled ones.
         seed: Seed of everything random.
         frames: Frames of PPO for each reward function.
-        bank: Segments, of whose steps the best is worth 0, as in :func:`plan`.
+        bank: Segments, of whose steps the best is worth 0, as in ``plan``.
         progress: Called with the number of policies trained so far.
     """
 
@@ -138,7 +138,7 @@ class Optimising(Rolling):
         self._trained: dict[bytes, Population] = {}
 
     def policies(self, hypotheses: HypothesisSet | None) -> PolicySet | Tensor | None:
-        """See :meth:`Rolling.policies`."""
+        """See ``Rolling.policies``."""
         if not isinstance(hypotheses, RewardSet):
             return super().policies(hypotheses)
         trained = [self._policy(hypotheses, member) for member in range(len(hypotheses))]
@@ -187,7 +187,7 @@ class Choosing:
         self.menus = torch.randint(len(bank), (menus, items), generator=stream(seed, "menus"))
 
     def __call__(self, hypotheses: HypothesisSet | None) -> TensorDict:
-        """See :class:`Acting`; random choice takes each menu's first item."""
+        """See ``Acting``; random choice takes each menu's first item."""
         if hypotheses is None:
             return self._episodes(self.menus[:, 0].unsqueeze(0))
         scores = segment_scores(

@@ -14,9 +14,9 @@ recoveries has a ``share_of_optimum`` beside it, from exact returns instead of r
 For the group ``all``: ``worst_recovery, worst_share_of_optimum`` and ``coverage`` of the groups.
 For a set also the number of ``distinct`` and ``effective`` members; how well it meets held-out
 raters whose groups nobody looks at (``further_accuracy, one_for_all_accuracy, gain, gain_error,
-favourite_share``, see :mod:`popl_rl.evaluation.held_out_raters`); and of the fair choice of one
-panel of held-out raters, its accuracy for the worst rater of another panel (``fair_worst_rater``)
-and the 10 % quantile (``fair_quantile``), and its recovery for the group that it serves worst
+favourite_share``, see ``popl_rl.evaluation.held_out_raters``); and of the fair choice of one panel
+of held-out raters, its accuracy for the worst rater of another panel (``fair_worst_rater``) and the
+10 % quantile (``fair_quantile``), and its recovery for the group that it serves worst
 (``fair_recovery``).
 """
 
@@ -156,7 +156,7 @@ class Evaluator:
 
         Args:
             hypotheses: What is chosen from.
-            method: How, see :meth:`~popl_rl.models.hypothesis_set.HypothesisSet.cater`.
+            method: How, see ``popl_rl.models.hypothesis_set.HypothesisSet.cater``.
             answers: Answers that are known of each; as configured if None.
         """
         known = self.protocol.answers if answers is None else answers
@@ -206,7 +206,7 @@ class Evaluator:
             baselines: One trained on everybody's answers, then one oracle per group; None to leave
                 them, and with them ``recovery``, out.
             reward_baselines: Other learners of reward functions, for
-                :class:`~popl_rl.evaluation.acting.Choosing` alone.
+                ``popl_rl.evaluation.acting.Choosing`` alone.
             label: Name of the method that found ``hypotheses``.
         """
         random = self._perform(None)

@@ -54,8 +54,8 @@ def roll_out(
         random_action: A behaviour to roll without policies.
 
     Returns:
-        TensorDict ``[P, E, H]`` as from :func:`~popl_rl.data.rollouts.lockstep`; discrete actions
-        are those of the environment, which need not begin with 0.
+        TensorDict ``[P, E, H]`` as from ``popl_rl.data.rollouts.lockstep``; discrete actions are
+        those of the environment, which need not begin with 0.
 
     Raises:
         ValueError: If ``episodes`` or ``max_steps`` is not positive, or there is nothing to roll.

@@ -189,7 +189,7 @@ def collect(suite: Suite, cells: Sequence[Cell], run_dir: Path) -> pd.DataFrame:
         Tidy rows ``suite, scenario, seed, method, choice, group, measure, value``.
 
     Raises:
-        ValueError: If a cell was run as something else, see :func:`is_finished`, or has rows of the
+        ValueError: If a cell was run as something else, see ``is_finished``, or has rows of the
             same name as another's.
     """
     tables = []

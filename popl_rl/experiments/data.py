@@ -46,7 +46,7 @@ _ABOUT = "about.json"
 
 
 def build_world(config: EnvConfig) -> World:
-    """The environment of a run, see :func:`~popl_rl.data.environments.make_world`.
+    """The environment of a run, see ``popl_rl.data.environments.make_world``.
 
     Raises:
         ValueError: If the environment cannot be resolved or built, or ``env.mixture`` names
@@ -65,8 +65,8 @@ def build_world(config: EnvConfig) -> World:
 def build_groups(config: RatersConfig, world: World) -> tuple[RaterGroup, ...]:
     """Resolve the rater groups.
 
-    Regret is exact where the environment has a transition table; elsewhere :func:`make_data` fits
-    the value of a state to each group's utility, and until then groups compare returns.
+    Regret is exact where the environment has a transition table; elsewhere ``make_data`` fits the
+    value of a state to each group's utility, and until then groups compare returns.
 
     Raises:
         ValueError: If a group cannot be resolved.
@@ -88,7 +88,7 @@ class Data:
 
     Attributes:
         segments: Replay buffer of N segments, one item each.
-        preferences: TensorDict ``[M]``, see :mod:`popl_rl.keys`.
+        preferences: TensorDict ``[M]``, see ``popl_rl.keys``.
         segment_utility: Worth of each segment to each group, ``[G, N]``; for evaluation only.
         store: Folder that the segments are kept in for all runs, if they are.
         groups: Names of the groups that were asked, in the order of ``("hidden", "group")``.
@@ -127,7 +127,7 @@ class Data:
 
 
 def describe(env: EnvConfig, config: DataConfig, *, seed: int) -> dict[str, Any]:
-    """All that decides about the segments of a run, for :func:`~popl_rl.data.store.store_path`."""
+    """All that decides about the segments of a run, for ``popl_rl.data.store.store_path``."""
     names = ("factory", "id", "options", "data_options", "mixture", "max_steps")
     # A node of a larger configuration may refer to other nodes of it.
     node = env if isinstance(env, DictConfig) else OmegaConf.structured(env)

@@ -139,7 +139,7 @@ class PolicySpec:
         return output.log_softmax(-1)
 
     def step_scores(self, output: Tensor, action: Tensor) -> Tensor:
-        """Log-probabilities of actions, ``[...]``; see :func:`log_prob`."""
+        """Log-probabilities of actions, ``[...]``; see ``log_prob``."""
         return log_prob(self, output, action)
 
     def conservatism(self, value: float) -> float:

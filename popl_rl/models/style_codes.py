@@ -194,7 +194,7 @@ def save_clone(clone: StyleClone, path: Path) -> None:
 
 
 def load_clone(spec: PolicySpec, path: Path) -> StyleClone:
-    """Read what :func:`save_clone` wrote.
+    """Read what ``save_clone`` wrote.
 
     Raises:
         FileNotFoundError: If there is none.

@@ -94,7 +94,7 @@ class PairPool:
         """Uniform pairs of two different segments, ``[num_pairs, 2]``; some may be drawn twice.
 
         Raises:
-            ValueError: If (nearly) all pairs were asked already, and as :func:`draw_pairs`.
+            ValueError: If (nearly) all pairs were asked already, and as ``draw_pairs``.
         """
         pairs = self._draw(num_pairs, generator)
         if self.asked is None:
@@ -145,8 +145,8 @@ def training_pool(segments: TensorDictBase) -> PairPool:
 def held_out_pool(segments: TensorDictBase, asked: Tensor) -> PairPool:
     """Pairs to evaluate on, none of which was asked in training.
 
-    Where segments say which state they go on from, all pairs of the starts that
-    :func:`training_pool` leaves out, so that not even a segment was shown. ``asked`` matters there
+    Where segments say which state they go on from, all pairs of the starts that ``training_pool``
+    leaves out, so that not even a segment was shown. ``asked`` matters there
     too: loaded preferences may be about any segments.
 
     Args:

@@ -1,4 +1,4 @@
-"""The single checks behind :func:`popl_rl.testing.check_env`; each raises with a cure.
+"""The single checks behind ``popl_rl.testing.check_env``; each raises with a cure.
 
 ``name`` is what messages call the environment.
 """

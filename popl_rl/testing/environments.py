@@ -19,8 +19,7 @@ def check_env(env: EnvReference, *, num_steps: int = 200, seed: int = 0, **argum
     """Check that an environment can be used here; the first fault found is raised.
 
     Args:
-        env: An environment, its factory, or a reference to the factory (see
-            :mod:`popl_rl.registry`).
+        env: An environment, its factory, or a reference to the factory (see ``popl_rl.registry``).
         num_steps: Random steps to take.
         seed: Seed of episodes and actions.
         **arguments: Keyword arguments for the factory.

@@ -53,13 +53,13 @@ def check_method(
 ) -> None:
     """Check that a method keeps what runs rely on; the first fault found is raised.
 
-    It learns for a few generations from the answers of two groups about :func:`tiny_env`: twice
-    from one seed, once interrupted and resumed as ``popl-train resume=`` does, and once from data
-    whose hidden keys are garbage.
+    It learns for a few generations from the answers of two groups about ``tiny_env``: twice from
+    one seed, once interrupted and resumed as ``popl-train resume=`` does, and once from data whose
+    hidden keys are garbage.
 
     Args:
-        method: A class with the protocol of :class:`popl_rl.algorithms.problem.Method`, a function
-            that makes one, or a reference to either.
+        method: A class with the protocol of ``popl_rl.algorithms.problem.Method``, a function that
+            makes one, or a reference to either.
         cases: What lexicase filters on.
         evolve: Whole networks, or last layers on a shared trunk.
         learns: Policies or reward functions.

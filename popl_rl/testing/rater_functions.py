@@ -28,7 +28,7 @@ def check_rater(
 
     Args:
         rater: A function from segments ``[B, T]`` to utilities ``[B, T]``, or a reference to one.
-        env: Where segments come from, as in :func:`check_env`. None takes :func:`tiny_env`.
+        env: Where segments come from, as in ``check_env``. None takes ``tiny_env``.
         seed: Seed of the random segments.
         **arguments: Keyword arguments for the environment's factory.
 

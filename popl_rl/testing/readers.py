@@ -28,10 +28,10 @@ def check_reader(
 
     Args:
         reader: A function from a path to segments ``[N, T]`` and preferences ``[M]``, or a
-            reference to one; see :data:`popl_rl.keys` for what they hold.
+            reference to one; see ``popl_rl.keys`` for what they hold.
         path: What it reads.
-        env: Where policies will act, as in :func:`popl_rl.testing.check_env`: observations and
-            actions must be of its spaces. None leaves that out.
+        env: Where policies will act, as in ``popl_rl.testing.check_env``: observations and actions
+            must be of its spaces. None leaves that out.
         **arguments: Keyword arguments for the environment's factory.
 
     Raises:

@@ -16,7 +16,7 @@ __all__ = ["likes_left", "likes_right", "tiny_env"]
 
 
 class _Walk(gymnasium.Env[Any, Any]):
-    """A line of five cells; see :func:`tiny_env`."""
+    """A line of five cells; see ``tiny_env``."""
 
     _CELLS = 5
 
@@ -75,11 +75,11 @@ def tiny_env(*, max_steps: int = 20) -> gymnasium.Env[Any, Any]:
 
 
 def likes_left(segments: TensorDictBase) -> Tensor:
-    """Want to be on the left of :func:`tiny_env`: 1 at the left end, down to 0 at the right."""
+    """Want to be on the left of ``tiny_env``: 1 at the left end, down to 0 at the right."""
     return 1 - likes_right(segments)
 
 
 def likes_right(segments: TensorDictBase) -> Tensor:
-    """Want to be on the right of :func:`tiny_env`: 0 at the left end, up to 1 at the right."""
+    """Want to be on the right of ``tiny_env``: 0 at the left end, up to 1 at the right."""
     cell: Tensor = segments[INFO, "next_state"]
     return cell.float() / (_Walk._CELLS - 1)
