@@ -73,7 +73,7 @@ def method_settings(config_of):
 def test_methods(name, method_settings):
     """Among it that one seed gives one result to the bit, and that resuming changes no bit."""
     method = method_settings(name)
-    sections = {part: getattr(method, part) for part in method.reads if part != "training"}
+    sections = {part: getattr(method, part) for part in method.sections() if part != "training"}
     kinds = {"cases": method.cases, "evolve": method.evolve}
     check_method(method.factory, **kinds, sections=sections, **method.options)
 

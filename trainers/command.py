@@ -12,7 +12,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from popl_rl.config import Config, EvaluateConfig, plain, unread, validate
+from popl_rl.config import Config, EvaluateConfig, MethodConfig, plain, unread, validate
 
 __all__ = ["USER_ERRORS", "prepare", "register_schemas", "run_command"]
 
@@ -85,7 +85,8 @@ def _readers() -> dict[str, list[str]]:
     for entry in files("popl_rl.configs.method").iterdir():
         if entry.name.endswith(".yaml"):
             content: Any = OmegaConf.create(entry.read_text(encoding="utf-8"))
-            found[entry.name.removesuffix(".yaml")] = list(content.get("reads", []))
+            given = {name: content[name] for name in ("factory", "reads") if name in content}
+            found[entry.name.removesuffix(".yaml")] = MethodConfig(**given).sections()
     return dict(sorted(found.items()))
 
 

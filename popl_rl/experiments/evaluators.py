@@ -1,5 +1,6 @@
 """The evaluator that fits what is learnt, and where."""
 
+import warnings
 from typing import Any, cast
 
 import torch
@@ -45,6 +46,9 @@ def make_evaluator(
         clone: A clone of the data's typical behaviour, for comparison; None for none.
         seed: Seed of the evaluation.
 
+    Warns:
+        UserWarning: If there are fewer held-out pairs than ``evaluation.pairs`` asks for.
+
     Raises:
         ValueError: If planning is asked for without a transition table.
     """
@@ -63,12 +67,21 @@ def make_evaluator(
         chooser = Choosing(segments, bank, menus=options.episodes, items=options.menu, seed=seed)
         return Evaluator(chooser, groups, bank, segment_utility, **common)
     bank = spec.bank(indexed(data.steps, world.env.action_space)).to(device)
+    pool = held_out_pool(data.steps, data.preferences[PAIR])
+    if pool.num_pairs < options.pairs:
+        warnings.warn(
+            f"evaluation.pairs asks for {options.pairs} held-out pairs, but the data have "
+            f"{pool.num_pairs}: pairs repeat, and accuracies are as precise as those of "
+            f"{pool.num_pairs}; set evaluation.pairs={pool.num_pairs} or collect more segments "
+            "(data.segments)",
+            stacklevel=2,
+        )
     return Evaluator(
         _acting(config, world, spec, bank, seed=seed),
         groups,
         bank,
         data.segment_utility,
-        pool=held_out_pool(data.steps, data.preferences[PAIR]),
+        pool=pool,
         clone=clone,
         **common,
     )

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from popl_rl.algorithms.problem import Method, Problem
 from popl_rl.algorithms.reward_baselines import RewardBaselines, train_reward_baselines
 from popl_rl.algorithms.trainer import MethodTrainer
-from popl_rl.config import Config, plain, validate
+from popl_rl.config import Config, load_config, plain, validate
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.data.environments import World, indexed, is_stateless
 from popl_rl.evaluation.diagnostics import diagnostics
@@ -34,7 +34,6 @@ from popl_rl.experiments.metrics import MetricsWriter
 from popl_rl.experiments.report import markdown
 from popl_rl.experiments.run_folder import (
     create_run_dir,
-    load_config,
     save_config,
     write_metadata,
 )
@@ -98,8 +97,12 @@ class References:
 def open_run(config: Config, *, command: Sequence[str]) -> tuple[Config, Path]:
     """Make the folder of a run, or find the one to continue with its own settings.
 
+    Args:
+        config: Settings that were checked; of a run that is continued, where it is.
+        command: What was typed, for ``metadata.json``.
+
     Raises:
-        ValueError: If settings are off.
+        ValueError: If the settings of the run that is continued are off.
         OSError: If the folder exists already, or there is no run to resume.
     """
     if config.resume is not None:
@@ -107,7 +110,6 @@ def open_run(config: Config, *, command: Sequence[str]) -> tuple[Config, Path]:
         config = plain(OmegaConf.merge(OmegaConf.structured(Config), load_config(run_dir)))
         validate(config)
     else:
-        validate(config)
         name = f"{config.method.name}-seed{config.seed}"
         wanted = None if config.run_dir is None else Path(config.run_dir)
         run_dir = create_run_dir(wanted, name=name)

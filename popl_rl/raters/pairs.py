@@ -112,6 +112,22 @@ class PairPool:
             "raters.answers)"
         )
 
+    @property
+    def num_pairs(self) -> int:
+        """Different pairs that can be drawn."""
+        start = torch.zeros(self.num_segments) if self.start is None else self.start
+        start = start if self.allowed is None else start[self.allowed]
+        each = start.unique(return_counts=True)[1]
+        found = int((each * (each - 1) // 2).sum())
+        if self.asked is None:
+            return found
+        asked = self.asked
+        if self.start is not None:
+            asked = asked[self.start[asked[:, 0]] == self.start[asked[:, 1]]]
+        if self.allowed is not None:
+            asked = asked[torch.isin(asked, self.allowed).all(1)]
+        return found - len(self._code(asked).unique())
+
     def _size(self) -> int:
         return self.num_segments if self.allowed is None else len(self.allowed)
 

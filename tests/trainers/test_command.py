@@ -7,6 +7,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from popl_rl.experiments import reevaluation
 from popl_rl.trainers import evaluate_policies, train_popl
 
 RATERS = """
@@ -101,13 +102,13 @@ def test_evaluating_keeps_the_runs_settings_and_asks_other_raters(
     call, finished, copied, monkeypatch
 ):
     found = []
-    original = evaluate_policies.make_evaluator
+    original = reevaluation.make_evaluator
 
     def watch(*arguments, **options):
         found.append(original(*arguments, **options))
         return found[-1]
 
-    monkeypatch.setattr(evaluate_policies, "make_evaluator", watch)
+    monkeypatch.setattr(reevaluation, "make_evaluator", watch)
     for overrides in (["seed=0"], ["evaluation.answers=3", "evaluation.reference=others"]):
         code, text = call(evaluate_policies.cli, f"run_dir={copied}", *overrides)
         assert code == 0, text
