@@ -71,7 +71,7 @@ def main(cfg: Any) -> None:
 
 def cli() -> None:
     """Console command ``popl-evaluate``."""
-    run_command(main)
+    run_command(main, EvaluateConfig)
 
 
 if __name__ == "__main__":

@@ -152,7 +152,7 @@ def main(cfg: Any) -> None:
 
 def cli() -> None:
     """Console command ``popl-benchmark``."""
-    run_command(main)
+    run_command(main, BenchmarkConfig)
 
 
 if __name__ == "__main__":

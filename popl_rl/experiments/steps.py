@@ -102,7 +102,8 @@ def open_run(config: Config, *, command: Sequence[str]) -> tuple[Config, Path]:
         command: What was typed, for ``metadata.json``.
 
     Raises:
-        ValueError: If the settings of the run that is continued are off.
+        ValueError: If the settings of the run that is continued are off, or those of a new one name
+            an environment, rater, method or reader that there is not.
         OSError: If the folder exists already, or there is no run to resume.
     """
     if config.resume is not None:
@@ -110,6 +111,7 @@ def open_run(config: Config, *, command: Sequence[str]) -> tuple[Config, Path]:
         config = plain(OmegaConf.merge(OmegaConf.structured(Config), load_config(run_dir)))
         validate(config)
     else:
+        _check_references(config)
         name = f"{config.method.name}-seed{config.seed}"
         wanted = None if config.run_dir is None else Path(config.run_dir)
         run_dir = create_run_dir(wanted, name=name)
@@ -118,6 +120,16 @@ def open_run(config: Config, *, command: Sequence[str]) -> tuple[Config, Path]:
     write_metadata(run_dir, command=command)
     torch.set_num_threads(config.threads)
     return config, run_dir
+
+
+def _check_references(config: Config) -> None:
+    """Raise for what cannot be resolved before there is a folder that a second try would find."""
+    resolve("env", config.env.factory)
+    resolve("method", config.method.factory)
+    for group in config.raters.groups:
+        resolve("rater", group)
+    if config.data.reader is not None:
+        resolve("reader", config.data.reader)
 
 
 def gather(config: Config, run_dir: Path) -> Setting:
