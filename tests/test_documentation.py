@@ -167,7 +167,7 @@ def test_the_data_shown_can_be_learnt_from(config_of, tiny, tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path)
     exec(block_with("popl_rl/README.md", "my_data"), {})
     [command] = [command for command in COMMANDS if "data.load=my_data" in command]
-    loaded = shlex.split(command)[1:]
+    loaded = [*shlex.split(command)[1:], "evaluation.pairs=12"]  # all that there are
     result = train_popl.run(config_of(*tiny[1:], *loaded, "run_dir=run"))
     assert len(result.policies) >= 1
 
