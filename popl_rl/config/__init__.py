@@ -1,8 +1,9 @@
 """Settings, with their defaults and what they mean. Imports neither torch nor TorchRL.
 
 ``data``: environment, raters and segments; ``method``: methods, a section for each part;
-``evaluation``: how the result is evaluated; ``run``: a whole run; ``checks``: how they check
-themselves; ``unread``: settings that the chosen method does not read.
+``evaluation``: how the result is evaluated; ``run``: a whole run; ``stored``: those of an earlier
+run; ``checks``: how they check themselves; ``unread``: settings that the chosen method does not
+read.
 """
 
 from popl_rl.config.checks import Checker, parse_epsilon
@@ -20,6 +21,7 @@ from popl_rl.config.method import (
     VPLSettings,
 )
 from popl_rl.config.run import Config, EvaluateConfig, LoggerConfig, plain, validate
+from popl_rl.config.stored import load_config
 from popl_rl.config.unread import unread
 
 __all__ = [
@@ -41,6 +43,7 @@ __all__ = [
     "ResponseConfig",
     "Training",
     "VPLSettings",
+    "load_config",
     "parse_epsilon",
     "plain",
     "unread",

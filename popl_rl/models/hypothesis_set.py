@@ -206,7 +206,7 @@ class HypothesisSet:
         alpha: float,
         discount: float,
     ) -> Self:
-        """A set of these members, with what :meth:`_write_more` wrote at ``path``."""
+        """A set of these members, with what ``_write_more`` wrote at ``path``."""
         return cls(population, alpha=alpha, discount=discount)
 
     @classmethod
@@ -216,7 +216,7 @@ class HypothesisSet:
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Read what :meth:`save` wrote.
+        """Read what ``save`` wrote.
 
         Raises:
             FileNotFoundError: If there is no set of this kind at ``path``.
