@@ -49,7 +49,7 @@ class GoalGrid(gymnasium.Env[Any, Any]):
         ValueError: If an argument is out of its range.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 6}  # noqa: RUF012 - as in Gymnasium
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 6}
 
     def __init__(
         self,
@@ -104,7 +104,9 @@ class GoalGrid(gymnasium.Env[Any, Any]):
         """Return every transition of this environment, exactly."""
         states, actions = self.size**2, len(_MOVES)
         shape = (states, actions)
-        after = [[self._after(state, action) for action in range(actions)] for state in range(states)]
+        after = [
+            [self._after(state, action) for action in range(actions)] for state in range(states)
+        ]
         next_state = torch.tensor(after)
         observation = torch.from_numpy(np.stack([self._observation(s) for s in range(states)]))
         steps = TensorDict(
@@ -124,7 +126,7 @@ class GoalGrid(gymnasium.Env[Any, Any]):
         return Table(steps, next_state, terminal, torch.full((states,), 1 / states))
 
     def behaviours(self) -> dict[str, Tensor | Explorer]:
-        """Return what data can show: an explorer and random actions, which nobody's wishes guide."""
+        """Return what data can show: an explorer and random actions, no one's own wish."""
         table = self.transition_table()
         uniform = torch.full(table.next_state.shape, 1 / len(_MOVES))
         return {"explorer": Explorer(table, self.cells), "random": uniform}

@@ -181,8 +181,8 @@ def _arguments(reference: str) -> tuple[str, tuple[Any, ...]]:
         arguments = ast.literal_eval(f"({listed},)") if listed.strip() else ()
     except (SyntaxError, ValueError) as error:
         raise ValueError(
-            f"rater {reference!r} has arguments that cannot be read; write numbers or quoted words, "
-            "as in ring(1, 12)."
+            f"rater {reference!r} has arguments that cannot be read; write numbers or quoted "
+            "words, as in ring(1, 12)."
         ) from error
     return called, arguments
 

@@ -4,63 +4,17 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 from torch import Tensor
 
-from popl_rl.algorithms.losses import CPLLoss, descend
+from popl_rl.algorithms.losses import CPLLoss
+from popl_rl.algorithms.specialists import specialists
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.population import Population
 from popl_rl.models.scoring import case_values, margins
 from popl_rl.selection.lexicase import lexicase_selection
 from popl_rl.selection.mad import mad
 
-__all__ = ["rater_similarity", "seed_with_specialists", "specialists"]
+__all__ = ["rater_similarity", "seed_with_specialists"]
 
 _MOST = 256  # specialists; more tell no more, but cost time and memory
-
-
-def specialists(
-    single: Population,
-    loss: CPLLoss,
-    comparisons: Comparisons,
-    raters: Tensor,
-    *,
-    steps: int = 20,
-    learning_rate: float = 1e-2,
-    batch_size: int = 16,
-    generator: torch.Generator,
-) -> Population:
-    """Copies of one member, each trained for a moment on the answers of one rater.
-
-    Args:
-        single: A population of one, trained on everybody's answers.
-        loss: The loss to descend; its population is not used.
-        comparisons: M strict preferences of C raters.
-        raters: S of them, by their cases.
-        steps: Gradient steps of each copy.
-        learning_rate: Adam's step size.
-        batch_size: Answers per step.
-        generator: Source of the batches.
-
-    Returns:
-        S members, in the order of ``raters``.
-    """
-    copies = single.subset([0] * len(raters))
-    own = CPLLoss(
-        copies,
-        loss.bank,
-        alpha=loss.alpha,
-        conservatism=loss.conservatism,
-        discount=loss.discount,
-        slip=loss.slip,
-    )
-    descend(
-        own,
-        torch.optim.Adam(copies.members.parameters(), lr=learning_rate),
-        comparisons,
-        steps=steps,
-        batch_size=batch_size,
-        weight=(comparisons.case == raters.unsqueeze(1)).float(),
-        generator=generator,
-    )
-    return copies
 
 
 def rater_similarity(margin: Tensor, comparisons: Comparisons, raters: Tensor) -> Tensor:

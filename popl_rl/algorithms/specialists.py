@@ -1,0 +1,115 @@
+"""A specialist for a rater: a copy of a common ancestor, trained for a moment on what one said."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from popl_rl.algorithms.cpl import pooled_population
+from popl_rl.algorithms.losses import CPLLoss, descend
+from popl_rl.algorithms.problem import Problem
+from popl_rl.config import POPLSettings
+from popl_rl.data.comparisons import Comparisons
+from popl_rl.models.population import Population
+from popl_rl.models.scoring import case_values
+
+__all__ = ["Specialists", "specialists", "train_specialists"]
+
+
+@dataclass(frozen=True)
+class Specialists:
+    """Specialists for some raters, and how well each ranks what the others said.
+
+    Attributes:
+        population: S members.
+        rater: Whom each is for, ``[S]``.
+        values: Share of each rater's answers that a specialist ranks as the rater did, ``[S, C]``.
+            Of its own rater a specialist says nothing: in its place is its mean over the others.
+    """
+
+    population: Population
+    rater: Tensor
+    values: Tensor
+
+
+def specialists(
+    single: Population,
+    loss: CPLLoss,
+    comparisons: Comparisons,
+    raters: Tensor,
+    *,
+    steps: int = 20,
+    learning_rate: float = 1e-2,
+    batch_size: int = 16,
+    generator: torch.Generator,
+) -> Population:
+    """Copies of one member, each trained for a moment on the answers of one rater.
+
+    Args:
+        single: A population of one, trained on everybody's answers.
+        loss: The loss to descend; its population is not used.
+        comparisons: M strict preferences of C raters.
+        raters: S of them, by their cases.
+        steps: Gradient steps of each copy.
+        learning_rate: Adam's step size.
+        batch_size: Answers per step.
+        generator: Source of the batches.
+
+    Returns:
+        S members, in the order of ``raters``.
+    """
+    copies = single.subset([0] * len(raters))
+    own = CPLLoss(
+        copies,
+        loss.bank,
+        alpha=loss.alpha,
+        conservatism=loss.conservatism,
+        discount=loss.discount,
+        slip=loss.slip,
+    )
+    descend(
+        own,
+        torch.optim.Adam(copies.members.parameters(), lr=learning_rate),
+        comparisons,
+        steps=steps,
+        batch_size=batch_size,
+        weight=(comparisons.case == raters.unsqueeze(1)).float(),
+        generator=generator,
+    )
+    return copies
+
+
+def train_specialists(
+    problem: Problem,
+    popl: POPLSettings,
+    *,
+    most: int,
+    generator: torch.Generator,
+) -> Specialists:
+    """Train a specialist for each of at most ``most`` random raters.
+
+    Args:
+        problem: What is to be learnt.
+        popl: Steps of the common ancestor and of each specialist.
+        most: Specialists, if there are as many raters.
+        generator: Source of raters, initial weights and batches.
+    """
+    comparisons = problem.comparisons
+    ancestor = pooled_population(problem, steps=popl.pooled_steps, generator=generator)
+    asked = comparisons.case.unique()
+    order = torch.randperm(len(asked), generator=generator, device=generator.device)
+    rater = asked[order[:most]]
+    found = specialists(
+        ancestor,
+        problem.loss(ancestor),
+        comparisons,
+        rater,
+        steps=popl.specialist_steps,
+        learning_rate=problem.training.learning_rate / 2,
+        generator=generator,
+    )
+    values = case_values(problem.margins(found) > 0, comparisons)
+    place = torch.arange(len(rater), device=rater.device)
+    own = values[place, rater]
+    others = (values.sum(1) - own) / max(1, values.shape[1] - 1)
+    return Specialists(found, rater, values.index_put((place, rater), others))
