@@ -29,7 +29,7 @@ QUICK = [
     "method.popl.specialist_steps=3",
     "method.popl.pooled_steps=4",
     "method.popl.warm_up=3",
-    "method.niches.specialists=20",
+    "method.refinement.steps=20",
     "method.em.groups=2",
 ]
 

@@ -139,6 +139,7 @@ def test_the_default_method_as_a_whole(learner, bank, comparisons, golden, kind)
         training__batch_size=16,
         popl__pooled_steps=10,
         popl__specialist_steps=5,
+        refinement__steps=60,
         **WHOLE[kind],
     )
     found = {}

@@ -39,7 +39,7 @@ QUICK = {
     "popl__warm_up": 3,
     "popl__pooled_steps": 4,
     "popl__specialist_steps": 3,
-    "niches__specialists": 6,
+    "refinement__steps": 20,
     "mixture__mixtures": 3,
     "mixture__generations": 3,
     "mixture__steps": 2,

@@ -4,11 +4,11 @@ Nothing here imports raters: a learner cannot see who voted.
 
 ``problem``: what every method is given (``Problem``) and what every method is (``Method``).
 ``losses``: the CPL loss and the loop that descends it; ``expectation``: the E-step of mixtures;
-``variation``: how children differ from their parents; ``rater_similarity``: who wants alike;
-``specialists``: a member for a rater; ``needed``: which members held-out answers need;
-``stacked_adam``: an optimiser for a population that grows and shrinks.
-``niches``: POPL with rater ids; ``popl``: POPL of heads and style codes; ``mixture_population``:
-POPL without rater ids; ``assembly``: POPL from its settings.
+``variation``: how children differ from their parents; ``rater_similarity``: who wants alike.
+``popl``: POPL; ``assembly``: POPL from its settings; ``refinement``: its last training;
+``mixture_population``: POPL without rater ids.
+``niches``: POPL for many groups; ``specialists``: a member for a rater; ``needed``: which members
+held-out raters need; ``stacked_adam``: an optimiser for a population that grows and shrinks.
 ``multi_cpl``: CPL ensembles; ``cpl``: pooled CPL and the oracle; ``em``: EM mixtures; ``vpl``: a
 latent variable; ``brex``, ``dpl``, ``reward_baselines``: reward learners that know no groups.
 ``trainer``: any method as a TorchRL Trainer with checkpoints.

@@ -1,4 +1,4 @@
-"""POPL from its settings: the population it starts from, selection, variation."""
+"""POPL from its settings: the population it starts from, selection, variation, refinement."""
 
 from typing import Any, cast
 
@@ -6,12 +6,11 @@ import torch
 
 from popl_rl.algorithms.cpl import pooled_population
 from popl_rl.algorithms.mixture_population import MixturePOPL
-from popl_rl.algorithms.niches import NichePOPL
 from popl_rl.algorithms.popl import POPL
 from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.rater_similarity import seed_with_specialists
 from popl_rl.algorithms.variation import GaussianHead, GradientCPL
-from popl_rl.config import MixtureSettings, NicheSettings, POPLSettings, parse_epsilon
+from popl_rl.config import MixtureSettings, POPLSettings, RefinementSettings, parse_epsilon
 from popl_rl.models.policies import build_network
 from popl_rl.models.population import Population
 from popl_rl.registry import resolve
@@ -21,15 +20,10 @@ __all__ = ["build_popl", "kind_of_variation"]
 
 
 def kind_of_variation(settings: POPLSettings, problem: Problem) -> str:
-    """The kind that ``auto`` stands for.
-
-    Mixtures without rater ids; with them niches for whole networks, gradient for heads and codes.
-    """
+    """The kind that ``auto`` stands for: gradient with rater ids, mixtures without."""
     if settings.variation != "auto":
         return settings.variation
-    if problem.comparisons.is_single:
-        return "mixtures"
-    return "niches" if problem.evolve == "all" and problem.clone is None else "gradient"
+    return "mixtures" if problem.comparisons.is_single else "gradient"
 
 
 def find_rule(reference: str, *, tournament: int) -> Selection | None:
@@ -51,16 +45,16 @@ def build_popl(
     problem: Problem,
     *,
     popl: POPLSettings | None = None,
-    niches: NicheSettings | None = None,
+    refinement: RefinementSettings | None = None,
     mixture: MixtureSettings | None = None,
     generator: torch.Generator,
-) -> POPL | NichePOPL | MixturePOPL:
+) -> POPL | MixturePOPL:
     """Build POPL: a population to start from, nothing selected yet.
 
     Args:
         problem: What is to be learnt.
         popl: Selection and variation.
-        niches: POPL with rater ids.
+        refinement: The last training.
         mixture: POPL without rater ids.
         generator: Source of all randomness.
 
@@ -68,15 +62,13 @@ def build_popl(
         ValueError: If settings do not go together, or a package that they need is missing.
     """
     popl = popl or POPLSettings()
+    refinement = refinement or RefinementSettings()
     select = find_rule(popl.selection, tournament=popl.tournament)
     kind = kind_of_variation(popl, problem)
     if kind == "mixtures":
         return MixturePOPL(
             problem, settings=mixture or MixtureSettings(), select=select, generator=generator
         )
-    if kind == "niches":
-        own = niches or NicheSettings()
-        return NichePOPL(problem, popl=popl, niches=own, select=select, generator=generator)
     options: dict[str, Any] = {
         "epsilon": cast("Any", parse_epsilon(popl.epsilon)),
         "select": select,
@@ -86,10 +78,15 @@ def build_popl(
         population = _first_heads(problem, popl, generator)
         variation = GaussianHead(population, std=popl.mutation_std, generator=generator)
         return POPL(problem, population=population, variation=variation, **options)
-    return _gradient(problem, popl, options)
+    return _gradient(problem, popl, refinement, options)
 
 
-def _gradient(problem: Problem, popl: POPLSettings, options: dict[str, Any]) -> POPL:
+def _gradient(
+    problem: Problem,
+    popl: POPLSettings,
+    refinement: RefinementSettings,
+    options: dict[str, Any],
+) -> POPL:
     generator = options["generator"]
     population = _first_heads(problem, popl, generator)
     variation = GradientCPL.of(problem, population, generator=generator)
@@ -110,11 +107,14 @@ def _gradient(problem: Problem, popl: POPLSettings, options: dict[str, Any]) -> 
         learning_rate=problem.training.learning_rate / 2,
         generator=generator,
     )
+    # It has not been tried for heads and reward functions.
+    tried = problem.evolve == "all" and problem.spec.refines
     return POPL(
         problem,
         population=population,
         variation=variation,
         similarity=similarity,
+        refinement=refinement if tried and refinement.steps else None,
         **options,
     )
 

@@ -65,7 +65,8 @@ def sufficient_size(nested: Nested, *, evidence: float) -> int:
         nested: The subsets.
         evidence: Standard errors; with 0 any improvement counts, with more there are fewer members.
     """
-    gain = nested.value.diff(dim=0)
-    error = gain.std(1, correction=0) / gain.shape[1] ** 0.5
-    too_little = (gain.mean(1) <= evidence * error).nonzero()
-    return 1 + (int(too_little[0]) if len(too_little) else len(gain))
+    for size, gain in enumerate(nested.value.diff(dim=0), start=1):
+        error = gain.std(correction=0) / len(gain) ** 0.5
+        if gain.mean() <= evidence * error:
+            return size
+    return len(nested.value)

@@ -1,4 +1,4 @@
-"""POPL with rater ids: members find niches, and lexicase selection founds new ones.
+"""POPL for many groups: members find niches, and lexicase selection founds new ones.
 
 Members divide the raters among themselves and descend CPL on those whom they serve, as gradient
 lexicase has a child learn where its parent is strong (Ding and Spector, ICLR 2022), but by degrees:
@@ -8,11 +8,11 @@ alone, members settle where they began, and a group that nobody began with is lo
 selection: while the search lasts, members that nobody needs make room for specialists, which are
 selected by lexicase over raters.
 
-Members exist in two copies until then (cross-fitting). Each copy is trained on one half of the
-raters, and tells whom members serve in the other half, and whether they are needed there: a member
-is needed if the set predicts raters better with it whom it was not trained on. Without this, members
-would confirm what they have learnt by heart. When only needed members are left, one copy goes on, on
-all answers.
+Members exist in two copies (cross-fitting). Each copy is trained on one half of the raters, and
+tells whom members serve in the other half, and whether they are needed there: whether the set
+predicts raters better with them whom they have not learnt of. Without this, members would confirm
+what they know by heart. When members have settled, those that are needed go on in a third copy,
+which is trained on all answers by the whole recipe; it is the result.
 """
 
 import warnings
@@ -22,6 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from popl_rl.algorithms.assembly import find_rule
 from popl_rl.algorithms.expectation import expect
 from popl_rl.algorithms.losses import descend
 from popl_rl.algorithms.needed import nested_subsets, sufficient_size
@@ -31,18 +32,14 @@ from popl_rl.algorithms.stacked_adam import StackedAdam
 from popl_rl.config import NicheSettings, POPLSettings
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.population import Population
-from popl_rl.models.preference_likelihood import per_case
+from popl_rl.models.preference_likelihood import log_likelihood, per_case
 from popl_rl.models.scoring import case_values, rater_accuracy
-from popl_rl.selection.lexicase import lexicase_selection
-from popl_rl.selection.rules import Selection
+from popl_rl.selection.lexicase import lexicase_given_first
 
 __all__ = ["NichePOPL"]
 
 #: Selections for each place to fill: several fall on the same specialist.
 _DRAWS = 8
-#: When members are dropped, as shares of the way from the end of the search to the last cut, and
-#: how many are kept for each one that is needed: a member may take a while to show what it is for.
-_CUTS = ((1 / 3, 1.25), (2 / 3, 1.1), (1.0, 1.0))
 
 
 class NichePOPL:
@@ -50,16 +47,15 @@ class NichePOPL:
 
     Args:
         problem: What is to be learnt; its cases are raters.
-        popl: How specialists are trained.
+        popl: How specialists are trained, and by which rule they are selected.
         niches: When and by how much evidence members come and go.
-        select: Rule by which specialists are selected, in the place of lexicase selection.
         generator: Source of all randomness.
 
     Attributes:
         generation: Generations done so far.
         generations: Generations after which it is finished.
-        sizes: Cross-fitted log-likelihood by number of members at the last cut, ``(members, mean,
-            standard error of the gain by the last one)``; empty before.
+        sizes: Cross-fitted log-likelihood by number of members when they were last counted,
+            ``(members, mean, standard error of the gain by the last one)``; empty before.
     """
 
     def __init__(
@@ -68,13 +64,14 @@ class NichePOPL:
         *,
         popl: POPLSettings,
         niches: NicheSettings,
-        select: Selection | None = None,
         generator: torch.Generator,
     ) -> None:
-        self.problem, self.settings, self.select = problem, niches, select
+        self.problem, self.settings = problem, niches
+        self.select = find_rule(popl.selection, tournament=popl.tournament)
         self.generator = generator
         self.generation = 0
-        self.generations = problem.generations
+        self.search, self.settled = _schedule(niches, problem.generations)
+        self.generations = self.settled + problem.generations
         self.sizes: list[tuple[int, float, float]] = []
         self.specialists = train_specialists(
             problem, popl, most=niches.specialists, generator=generator
@@ -85,7 +82,6 @@ class NichePOPL:
         self.stack = self.specialists.population.subset(founders * self.copies)
         self.share = torch.full((len(founders),), 1 / len(founders), device=problem.device)
         self.training = StackedAdam(self.stack, problem.training.learning_rate)
-        self._selections, self._cuts = _schedule(niches, self.generations)
 
     def step(self) -> dict[str, float]:
         """Run one generation.
@@ -97,10 +93,10 @@ class NichePOPL:
         """
         problem, comparisons = self.problem, self.problem.comparisons
         now = self.generation
-        if now in self._selections:
+        if now in self.search:
             self._replace_unneeded()
-        if now in self._cuts:
-            self._drop_unneeded(self._cuts[now], last=now == max(self._cuts))
+        if now == self.settled:
+            self._settle()
         scores = problem.scores(self.stack)
         mine = scores[-len(self.share) :]
         passes = mine[:, comparisons.preferred] > mine[:, comparisons.other]
@@ -110,8 +106,8 @@ class NichePOPL:
         # A member that serves nobody still needs something: everything, a bit.
         weight = (served[:, comparisons.case] + 1e-9).repeat(self.copies, 1)
         weight = weight * self._trained_on().repeat_interleave(len(self.share), 0)
-        # Held for half of the generations, then falling to zero.
-        rate = min(1.0, 2 * (1 - now / self.generations))
+        # Held until the members have settled and for half of what follows, then falling to zero.
+        rate = min(1.0, 2 * (self.generations - now) / problem.generations)
         self.training.optimizer.param_groups[0]["lr"] = problem.training.learning_rate * rate
         loss = descend(
             problem.loss(self.stack),
@@ -133,7 +129,7 @@ class NichePOPL:
 
     @property
     def population(self) -> Population:
-        """The members as they are now; of two copies, the second."""
+        """The members as they are now, in their last copy."""
         count = len(self.share)
         return self.stack.subset(range((self.copies - 1) * count, self.copies * count))
 
@@ -143,65 +139,72 @@ class NichePOPL:
         found.origin = []  # the population has been cut down to them
         return self.problem.calibrated(found)
 
-    def _selected(self, count: int) -> list[int]:
-        """Up to ``count`` different specialists, selected by what they are to all raters."""
+    def _selected(self, count: int, value: Tensor | None = None) -> list[int]:
+        """Up to ``count`` different specialists, selected by what they are to the raters.
+
+        Args:
+            count: Places to fill.
+            value: How well each rater is predicted so far, ``[C]``; if given, the first cases of
+                every other selection are raters out of the third who are predicted worst.
+        """
         values, generator = self.specialists.values, self.generator
         draws = _DRAWS * count
-        if self.select is None:
-            chosen = lexicase_selection(values, draws, generator=generator)
-        else:
+        if self.select is not None:
             chosen = self.select(values, draws, generator=generator)
+            return list(dict.fromkeys(chosen.tolist()))[:count]
+        raters = values.shape[1]
+        first = torch.randint(raters, (draws,), generator=generator, device=values.device)
+        if value is not None:
+            worst = value.argsort()[: -(-raters // 3)]
+            first[::2] = worst[first[::2] % len(worst)]
+        chosen = lexicase_given_first(values, first, generator=generator).parents
         return list(dict.fromkeys(chosen.tolist()))[:count]
 
     def _replace_unneeded(self) -> None:
         """Fill the places of members that nobody needs by selected specialists."""
         nested = nested_subsets(self._likelihood(), self.problem.comparisons)
         needed = int(nested.value.mean(1).argmax()) + 1
-        born = self._selected(max(1, self.problem.members - needed))
+        born = self._selected(max(1, self.problem.members - needed), nested.value[needed - 1])
         self._become(nested.order[:needed], born)
 
-    def _drop_unneeded(self, spare: float, *, last: bool) -> None:
-        """Keep the members that are needed, and some more of those that are not yet."""
+    def _settle(self) -> None:
+        """Keep the members that are needed, in a third copy that learns of all raters."""
         nested = nested_subsets(self._likelihood(), self.problem.comparisons)
-        if last:
-            needed = sufficient_size(nested, evidence=self.settings.evidence)
-        else:
-            needed = int(nested.value.mean(1).argmax()) + 1
-        self._become(nested.order[: -int(-needed * spare // 1)], [])
-        if not last:
-            return
-        count = len(self.share)
-        self.stack = self.stack.subset(range(count))
-        self.training = self.training.moved_to(self.stack, range(count))
-        self.copies = 1
-        gain = nested.value.diff(dim=0, prepend=torch.zeros_like(nested.value[:1]))
+        needed = sufficient_size(nested, evidence=self.settings.evidence)
+        if needed >= self.problem.members:
+            warnings.warn(
+                f"all {needed} members are needed, so there may be more groups than members; raise "
+                "method.members",
+                stacklevel=2,
+            )
+        self._become(nested.order[:needed], [])
+        everything = torch.arange(3 * needed) % (2 * needed)
+        stack = self.stack.subset(everything)
+        self.training = self.training.moved_to(stack, everything)
+        self.stack, self.copies = stack, 3
+        gain = nested.value.diff(dim=0, prepend=nested.value[:1])
         error = gain.std(1, correction=0) / gain.shape[1] ** 0.5
         rows = zip(nested.value.mean(1).tolist(), error.tolist(), strict=True)
         self.sizes = [(size, *row) for size, row in enumerate(rows, start=1)]
-        if needed >= self.problem.members:
-            warnings.warn(
-                f"all {needed} members are needed, so there may be more groups than members; "
-                "raise method.members",
-                stacklevel=2,
-            )
 
     def _likelihood(self) -> Tensor:
-        """Log-likelihood of every comparison under every member, ``[K, M]``, told as below."""
-        return self._told(self.problem.likelihood(self.problem.scores(self.stack)))
+        """Log-likelihood of every answer under every member, ``[K, M]``, as catering reckons it.
+
+        Without the conservatism of training, under which the chances of an answer and of its
+        opposite do not sum to 1: that would count members that find all segments of a rater likely.
+        """
+        margin = self.problem.margins(self.stack)
+        return self._told(log_likelihood(margin, self.problem.training.slip))
 
     def _told(self, likelihood: Tensor) -> Tensor:
-        """Of both copies ``[2 K, M]``, what the one says that was not trained on the rater."""
-        if self.copies == 1:
-            return likelihood
-        first, second = likelihood.chunk(2)
+        """Of all copies ``[copies * K, M]``, what the one says that has not learnt of the rater."""
+        first, second = likelihood.chunk(self.copies)[:2]
         return torch.where(self.half[self.problem.comparisons.case] == 0, first, second)
 
     def _trained_on(self) -> Tensor:
-        """Comparisons that each copy learns from: those of the other half, ``[copies, M]``."""
+        """Comparisons that each copy learns from, ``[copies, M]``: of one half, or all."""
         half = self.half[self.problem.comparisons.case]
-        if self.copies == 1:
-            return torch.ones_like(half).unsqueeze(0)
-        return torch.stack([half, 1 - half])
+        return torch.stack([half, 1 - half, torch.ones_like(half)][: self.copies])
 
     def _become(self, kept: Sequence[int], born: Sequence[int]) -> None:
         """Go on with some of the members, and with some specialists beside them, in every copy."""
@@ -256,13 +259,8 @@ def _halves(problem: Problem, generator: torch.Generator) -> Tensor:
     return torch.randperm(raters, generator=generator, device=problem.device) % 2
 
 
-def _schedule(settings: NicheSettings, generations: int) -> tuple[set[int], dict[int, float]]:
-    """Generations before which specialists come in, and before which members are dropped.
-
-    The latter with the number of members that are kept for each one that is needed.
-    """
-    begin, end = settings.search * generations, settings.settled * generations
+def _schedule(settings: NicheSettings, generations: int) -> tuple[set[int], int]:
+    """Generations before which specialists come in, and the one by which members have settled."""
+    settled = max(1, round(settings.settled * generations))
     times = range(1, settings.selections + 1)
-    selections = {max(1, int(begin * time / settings.selections)) for time in times}
-    cuts = {int(begin + part * (end - begin)): spare for part, spare in _CUTS}
-    return selections, cuts
+    return {max(1, settled * time // (2 * settings.selections)) for time in times}, settled

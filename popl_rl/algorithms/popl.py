@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from popl_rl.algorithms.problem import Problem
+from popl_rl.algorithms.refinement import refine
 from popl_rl.algorithms.variation import Variation
+from popl_rl.config import RefinementSettings
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.population import Population
 from popl_rl.models.scoring import case_values, rater_accuracy
@@ -28,7 +30,7 @@ __all__ = ["POPL"]
 
 
 class POPL:
-    """One generation after the other: score, select, vary.
+    """One generation after the other: score, select, vary; at the end, refine.
 
     Args:
         problem: What is to be learnt.
@@ -42,6 +44,8 @@ class POPL:
             overlooked.
         select: Rule that takes the place of lexicase selection; for whom children are, and what
             they learn, stays as it is.
+        refinement: How what has been found is to be trained when all generations are done; None to
+            keep every distinct member as it is.
         generator: Source of all randomness.
 
     Attributes:
@@ -58,6 +62,7 @@ class POPL:
         epsilon: float | Literal["mad"] | None = "mad",
         similarity: Tensor | None = None,
         select: Selection | None = None,
+        refinement: RefinementSettings | None = None,
         generator: torch.Generator,
     ) -> None:
         self.problem = problem
@@ -66,6 +71,7 @@ class POPL:
         self.epsilon = epsilon
         self.similarity = similarity
         self.select = select
+        self.refinement = refinement
         self.generator = generator
         self.generation = 0
         self.generations = problem.generations
@@ -118,8 +124,15 @@ class POPL:
         return torch.cat([first, spread_out(similarity, spread, generator=self.generator)])
 
     def result(self) -> HypothesisSet:
-        """One member for each behaviour, scaled for catering."""
-        return self.problem.calibrated(self.problem.distinct(self.population))
+        """The refined members, or one member for each behaviour, scaled for catering."""
+        if self.refinement is None:
+            return self.problem.calibrated(self.problem.distinct(self.population))
+        refined = refine(
+            self.problem, self.population, settings=self.refinement, generator=self.generator
+        )
+        found = self.problem.hypothesis_set(refined)
+        found.origin = []  # trained on, they are no longer members of the population
+        return self.problem.calibrated(found)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the next generation depends on."""

@@ -17,6 +17,7 @@ from popl_rl.config.method import (
     MixtureSettings,
     NicheSettings,
     POPLSettings,
+    RefinementSettings,
     Training,
     VPLSettings,
 )
@@ -40,6 +41,7 @@ __all__ = [
     "NicheSettings",
     "POPLSettings",
     "RatersConfig",
+    "RefinementSettings",
     "ResponseConfig",
     "Training",
     "VPLSettings",

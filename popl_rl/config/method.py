@@ -13,6 +13,7 @@ __all__ = [
     "MixtureSettings",
     "NicheSettings",
     "POPLSettings",
+    "RefinementSettings",
     "Training",
     "VPLSettings",
 ]
@@ -45,7 +46,7 @@ class POPLSettings:
     selection: str = "lexicase"  # of parents: lexicase or a reference of kind selection
     tournament: int = 4  # members in a tournament (selection=tournament)
     epsilon: str | None = "mad"  # tolerance of lexicase: mad, a number, or null for none
-    variation: str = "auto"  # niches, gradient, gaussian (published), mixtures; auto: see README
+    variation: str = "auto"  # gradient, gaussian (published), mixtures; auto goes by the cases
     rater_similarity: bool = True  # children learn from raters like the one they are for (ids)
     specialist_steps: int = 30  # CPL steps of the specialist for each rater (rater_similarity)
     pooled_steps: int = 200  # CPL steps on all answers: features=pooled, or before specialists
@@ -58,7 +59,7 @@ class POPLSettings:
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
         at.at_least_one(self, "tournament", "specialist_steps", "pooled_steps")
-        at.one_of(self, "variation", ("auto", "niches", "gradient", "gaussian", "mixtures"))
+        at.one_of(self, "variation", ("auto", "gradient", "gaussian", "mixtures"))
         at.one_of(self, "features", ("random", "pooled"))
         at.not_negative(self, "warm_up")
         at.positive(self, "mutation_std")
@@ -70,21 +71,33 @@ class POPLSettings:
 
 
 @dataclass
+class RefinementSettings:
+    """POPL's last training: which members to keep, each trained on the raters whom it serves."""
+
+    steps: int = 1500  # CPL steps; 0 for none (policies, gradient variation, rater ids)
+    folds: int = 4  # folds of the cross-fitting
+    most: int = 8  # members to begin with, at most
+
+    def check(self, at: Checker) -> None:
+        """Report values that are out of range."""
+        at.not_negative(self, "steps")
+        at.at_least_one(self, "most")
+        at.expect(self.folds >= 2, "folds", "at least 2", self.folds)
+
+
+@dataclass
 class NicheSettings:
-    """POPL with rater ids: when members come and go (whole networks)."""
+    """POPL for many groups: when members come and go."""
 
     specialists: int = 256  # raters, at most, for each of whom a specialist may be selected
-    selections: int = 3  # times that unneeded members make room for selected specialists
-    search: float = 0.25  # share of the generations over which these times are spread
-    settled: float = 0.6  # share of the generations after which only needed members are left
+    selections: int = 1  # times that unneeded members make room for selected specialists
+    settled: float = 0.4  # length of the search, which comes on top, as a share of the generations
     evidence: float = 0.5  # standard errors by which a member has to improve the prediction
 
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
         at.at_least_one(self, "specialists", "selections")
-        at.expect(0 < self.search < 1, "search", "in (0, 1)", self.search)
-        within = self.search < self.settled < 1
-        at.expect(within, "settled", "between niches.search and 1", self.settled)
+        at.positive(self, "settled")
         at.not_negative(self, "evidence")
 
 
@@ -167,6 +180,7 @@ _POPL = "popl_rl.algorithms.assembly:build_popl"
 SECTIONS = {
     "training": Training,
     "popl": POPLSettings,
+    "refinement": RefinementSettings,
     "niches": NicheSettings,
     "mixture": MixtureSettings,
     "clone": CloneSettings,
@@ -194,6 +208,7 @@ class MethodConfig:
     generations: int = 100  # in which the steps of the training are divided
     training: Training = field(default_factory=Training)
     popl: POPLSettings = field(default_factory=POPLSettings)
+    refinement: RefinementSettings = field(default_factory=RefinementSettings)
     niches: NicheSettings = field(default_factory=NicheSettings)
     mixture: MixtureSettings = field(default_factory=MixtureSettings)
     clone: CloneSettings = field(default_factory=CloneSettings)
@@ -206,7 +221,7 @@ class MethodConfig:
         if self.reads is not None:
             return list(self.reads)
         if self.factory == _POPL:
-            return ["training", "popl", "niches", "mixture"]
+            return ["training", "popl", "refinement", "mixture"]
         return ["training"]
 
     def check(self, at: Checker) -> None:
@@ -234,10 +249,6 @@ class MethodConfig:
         at.expect(self.members >= 2, "members", "at least 2, to select among", self.members)
         if self.popl.variation == "gaussian":
             at.expect(self.evolve == "head", "evolve", "head for Gaussian variation", self.evolve)
-        niches = self.popl.variation == "niches"
-        at.expect(self.evolve == "all" or not niches, "evolve", "all for niches", self.evolve)
-        ids = "rater for niches, which share the raters out"
-        at.expect(self.cases == "rater" or not niches, "cases", ids, self.cases)
         mixtures = self.popl.variation == "mixtures"
         if mixtures or (self.cases == "preference" and self.popl.variation == "auto"):
             at.expect(self.evolve != "code", "evolve", "all without rater ids", self.evolve)

@@ -28,6 +28,7 @@ class Spec(Protocol):
         hidden: Units of each hidden layer.
         discrete: Whether an action is a choice of one among the ``action_dim`` outputs.
         output_bias: Whether the last layer has a bias.
+        refines: Whether POPL's last training has been tried for this kind.
     """
 
     @property
@@ -40,6 +41,8 @@ class Spec(Protocol):
     def discrete(self) -> bool: ...  # noqa: D102
     @property
     def output_bias(self) -> bool: ...  # noqa: D102
+    @property
+    def refines(self) -> bool: ...  # noqa: D102
 
     def table(self, output: Tensor) -> Tensor:
         """What choosing each of the outputs adds to a segment's score, ``[..., K]``."""
@@ -120,6 +123,11 @@ class PolicySpec:
             )
         first = first_action(action)
         return cls(observation.shape[0], size, discrete, tuple(hidden), action_std, first)
+
+    @property
+    def refines(self) -> bool:
+        """Whether POPL's last training has been tried for this kind of hypotheses."""
+        return True
 
     @property
     def output_bias(self) -> bool:

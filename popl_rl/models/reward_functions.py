@@ -63,6 +63,11 @@ class RewardSpec:
         return True
 
     @property
+    def refines(self) -> bool:
+        """Whether POPL's last training has been tried for this kind of hypotheses."""
+        return False
+
+    @property
     def output_bias(self) -> bool:
         """There is none, see above."""
         return False

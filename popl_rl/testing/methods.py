@@ -19,6 +19,7 @@ from popl_rl.config import (
     MixtureSettings,
     NicheSettings,
     POPLSettings,
+    RefinementSettings,
     VPLSettings,
 )
 from popl_rl.models.hypothesis_set import HypothesisSet
@@ -32,6 +33,7 @@ __all__ = ["check_method"]
 #: Sections of settings for a factory that names them among its arguments: as small as they can be.
 _SECTIONS: dict[str, Any] = {
     "popl": POPLSettings(specialist_steps=3, pooled_steps=4, warm_up=3),
+    "refinement": RefinementSettings(steps=20),
     "niches": NicheSettings(specialists=6),
     "mixture": MixtureSettings(
         mixtures=3, generations=3, steps=2, first_selection=1, final_steps=4

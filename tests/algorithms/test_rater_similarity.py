@@ -2,7 +2,8 @@ import pytest
 import torch
 
 from popl_rl.algorithms.losses import CPLLoss
-from popl_rl.algorithms.rater_similarity import rater_similarity, seed_with_specialists, specialists
+from popl_rl.algorithms.rater_similarity import rater_similarity, seed_with_specialists
+from popl_rl.algorithms.specialists import specialists
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.population import Population

@@ -1,0 +1,187 @@
+"""From an evolved population to the few policies that people get: which to keep, one last training.
+
+Selection finds out who there is. What it leaves is many members that serve the same raters nearly
+alike, each trained on whatever it was selected for last. :func:`smallest_subset` keeps as few as
+predict the raters as well as more of them do, and :func:`refine` trains each on those whom it
+serves: EM (Dempster, Laird and Rubin, 1977) from where evolution has ended, which has also told it
+how many there are.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from popl_rl.algorithms.expectation import expect
+from popl_rl.algorithms.losses import CPLLoss
+from popl_rl.algorithms.problem import Problem
+from popl_rl.config import RefinementSettings
+from popl_rl.data.comparisons import Comparisons
+from popl_rl.models.population import Population
+from popl_rl.models.preference_likelihood import leave_one_out, per_case
+
+__all__ = ["predictive", "refine", "smallest_subset"]
+
+_CUTS = (0.2, 0.4)  # of the steps, after which members that nobody needs are dropped
+_LOOKS = 30  # E-steps, one before each block of gradient steps
+
+
+def predictive(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
+    """How well a set that is catered by a case's other answers predicts each of them.
+
+    Args:
+        likelihood: Log-likelihood of every comparison under every member, ``[K, M]``.
+        comparisons: The M comparisons and the case of each.
+
+    Returns:
+        Mean log-likelihood of each case's answers, ``[C]``.
+    """
+    count = comparisons.case.bincount(minlength=comparisons.num_cases).clamp(min=1)
+    mean: Tensor = per_case(leave_one_out(likelihood, comparisons), comparisons) / count
+    return mean
+
+
+def smallest_subset(likelihood: Tensor, comparisons: Comparisons, *, most: int = 8) -> list[int]:
+    """As few members as predict the raters as well as more of them do.
+
+    Members are added one after the other, each time the one that helps :func:`predictive` most.
+    Of these nested subsets the smallest within one standard error of the best is taken (Breiman et
+    al., 1984): a further member has to earn its place.
+
+    Args:
+        likelihood: Log-likelihood of every comparison under every member, ``[N, M]``.
+        comparisons: The M comparisons and the case of each.
+        most: Size of the largest subset.
+
+    Returns:
+        Members, the most useful one first.
+    """
+    chosen: list[int] = []
+    values = []
+    for _ in range(min(most, len(likelihood))):
+        rest = [member for member in range(len(likelihood)) if member not in chosen]
+        each = torch.stack([predictive(likelihood[[*chosen, one]], comparisons) for one in rest])
+        best = int(each.mean(1).argmax())
+        chosen.append(rest[best])
+        values.append(each[best])
+    value = torch.stack(values)
+    behind = value[value.mean(1).argmax()] - value
+    # A single case has no spread to judge by.
+    error = behind.std(1, correction=0) / behind.shape[1] ** 0.5
+    good = behind.mean(1) <= error
+    return chosen[: int(good.float().argmax()) + 1]
+
+
+def refine(
+    problem: Problem,
+    population: Population,
+    *,
+    settings: RefinementSettings,
+    generator: torch.Generator,
+) -> Population:
+    """Choose a few members and train each on the raters whom it serves.
+
+    ``folds + 1`` copies of the chosen members train side by side. Copy f leaves the cases of fold f
+    out and tells who serves them; the last copy trains on everything and is the result. Without
+    this every member would confirm what it has learnt by heart. The same held-out likelihoods tell,
+    twice in the first half, which members nobody needs.
+
+    The E-step and the gradient steps maximise one likelihood, that of answers with slips on CPL's
+    conservative margins ``S(sigma+) - lambda S(sigma-)``, under the recipe of the problem.
+
+    Args:
+        problem: What is to be learnt; batches are shared by all members.
+        population: N evolved members; copied.
+        settings: Steps, folds and the most members to begin with.
+        generator: Source of folds and batches.
+
+    Returns:
+        At most ``settings.most`` members.
+    """
+    training = _CrossFitting(problem, population, settings, generator)
+    blocks = min(_LOOKS, settings.steps)
+    steps = [settings.steps * (block + 1) // blocks for block in range(blocks)]
+    cuts = {int(cut * blocks) for cut in _CUTS}
+    for block, (begin, end) in enumerate(zip([0, *steps[:-1]], steps, strict=True)):
+        if block in cuts:
+            training.drop()
+        training.expect()
+        # The learning rate is held for half of the blocks, then falls to zero.
+        training.descend(end - begin, rate=min(1.0, 2 - 2 * block / blocks))
+    return training.result()
+
+
+class _CrossFitting:
+    """``folds + 1`` copies of a few members, each but the last without one fold of the cases."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        population: Population,
+        settings: RefinementSettings,
+        generator: torch.Generator,
+    ) -> None:
+        self.problem, self.generator = problem, generator
+        comparisons, device = problem.comparisons, problem.device
+        self.folds = settings.folds
+        order = torch.randperm(comparisons.num_cases, generator=generator, device=device)
+        self.fold = order % settings.folds
+        self.case = torch.arange(comparisons.num_cases, device=device)
+        self.row = torch.arange(len(comparisons), device=device)
+        self.use = torch.ones(settings.folds + 1, len(comparisons), device=device)
+        self.use[self.fold[comparisons.case], self.row] = 0.0
+        chosen = smallest_subset(self._likelihood(population), comparisons, most=settings.most)
+        self.share = torch.full((len(chosen),), 1 / len(chosen), device=device)
+        self._train(population.subset(chosen * (settings.folds + 1)))
+        self.weight = torch.ones(len(self.copies), len(comparisons), device=device)
+
+    def _train(self, copies: Population) -> None:
+        self.copies = copies
+        self.loss: CPLLoss = self.problem.loss(copies)
+        rate = self.problem.training.learning_rate
+        self.optimizer = torch.optim.Adam(copies.members.parameters(), lr=rate)
+
+    def _likelihood(self, population: Population) -> Tensor:
+        """Log-likelihood of every comparison under every member, ``[N, M]``."""
+        return self.problem.likelihood(self.problem.scores(population))
+
+    def _by_copy(self) -> Tensor:
+        likelihood: Tensor = self._likelihood(self.copies).unflatten(0, (self.folds + 1, -1))
+        return likelihood
+
+    def drop(self) -> None:
+        """Keep the members that held-out answers need."""
+        comparisons = self.problem.comparisons
+        held_out = self._by_copy()[self.fold[comparisons.case], :, self.row].T
+        kept: Sequence[int] = sorted(smallest_subset(held_out, comparisons))
+        index = torch.arange(len(self.copies), device=self.share.device)
+        index = index.view(self.folds + 1, -1)[:, kept]
+        self.share = self.share[kept]
+        self._train(self.copies.subset(index.flatten()))
+
+    def expect(self) -> None:
+        """E-step: whom each member serves, told by copies that have not seen the case."""
+        likelihood = per_case(self._by_copy(), self.problem.comparisons)
+        served = expect(likelihood, self.share).responsibility[self.fold, :, self.case].T
+        self.share = served.mean(1)
+        everywhere = served[:, self.problem.comparisons.case]
+        self.weight = (self.use.unsqueeze(1) * everywhere).flatten(0, 1)
+
+    def descend(self, steps: int, *, rate: float) -> None:
+        """Gradient steps on batches that all copies share."""
+        training, comparisons = self.problem.training, self.problem.comparisons
+        self.optimizer.param_groups[0]["lr"] = training.learning_rate * rate
+        shape, device = (training.batch_size,), self.share.device
+        for _ in range(steps):
+            index = torch.randint(len(comparisons), shape, generator=self.generator, device=device)
+            losses = self.loss.pairs(comparisons.preferred[index], comparisons.other[index])
+            loss = (losses * self.weight[:, index]).mean(1).sum()
+            self.optimizer.zero_grad(set_to_none=True)
+            loss.backward()  # type: ignore[no-untyped-call]
+            self.optimizer.step()
+            self.copies.constrain_()
+
+    def result(self) -> Population:
+        """The copies that were trained on everything."""
+        count = len(self.copies)
+        return self.copies.subset(range(count - len(self.share), count))
