@@ -14,7 +14,7 @@ class Explorer:
     """Walks to one random cell after the other by a shortest path.
 
     What it shows links everything that raters may care about: without it no segment of
-    :class:`~popl_rl.envs.two_doors.TwoDoors` shows both doors, and then nothing that is said about
+    `popl_rl.envs.two_doors.TwoDoors` shows both doors, and then nothing that is said about
     one door has to do with what is said about the other, so that without rater ids the groups could
     not be told apart.
 

@@ -171,7 +171,7 @@ class GoalGrid(gymnasium.Env[Any, Any]):
 def goal_grid(
     *, size: int = 7, goals: int = 12, max_steps: int = 30, render_mode: str | None = None
 ) -> gymnasium.Env[Any, Any]:
-    """Make a :class:`GoalGrid`, whose arguments these are."""
+    """Make a `GoalGrid`, whose arguments these are."""
     return GoalGrid(size=size, goals=goals, max_steps=max_steps, render_mode=render_mode)
 
 
@@ -180,7 +180,7 @@ def visits(segments: TensorDictBase, goal: int) -> Tensor:
     """Want to be in the cell of one goal, as many steps as possible.
 
     Args:
-        segments: Segments ``[B, T]`` of :class:`GoalGrid`.
+        segments: Segments ``[B, T]`` of `GoalGrid`.
         goal: Number of the goal, from 0.
     """
     reached: Tensor = segments[INFO, "reached"]

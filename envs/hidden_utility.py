@@ -195,7 +195,7 @@ def ring(segments: TensorDictBase, place: float, places: float = 1) -> Tensor:
     ``d^2 + (1 - d)^2`` of all pairs of states alike.
 
     Args:
-        segments: Segments ``[B, T]`` of :class:`HiddenUtility`.
+        segments: Segments ``[B, T]`` of `HiddenUtility`.
         place: Place on the ring.
         places: Length of the ring.
     """
@@ -207,7 +207,7 @@ def blend(segments: TensorDictBase, weight: float) -> Tensor:
     """Want both coordinates of a state to be large, the first ``weight`` times as much.
 
     Args:
-        segments: Segments ``[B, T]`` of :class:`HiddenUtility` with two coordinates (or more, of
+        segments: Segments ``[B, T]`` of `HiddenUtility` with two coordinates (or more, of
             which only two count).
         weight: Weight of the first coordinate; the second has the rest to 1.
 

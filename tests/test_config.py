@@ -105,8 +105,8 @@ CASES = [
     ("data__reader", "my.py:read", "data.reader must be null without data.load, got 'my.py:read'"),
     ("method__factory", "", "method.factory must be a reference of a method, got ''"),
     ("method__reads", ["training", "magic"],
-     "method.reads must be sections out of training, popl, refinement, mixture, clone, em, vpl, "
-     "got ['magic']"),
+     "method.reads must be sections out of training, popl, refinement, niches, mixture, clone, em, "
+     "vpl, got ['magic']"),
     ("method__popl__selection", "",
      "method.popl.selection must be lexicase or a reference, got ''"),
     ("method__vpl__kl", -0.5, "method.vpl.kl must be at least 0, got -0.5"),

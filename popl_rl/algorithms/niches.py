@@ -11,8 +11,8 @@ selected by lexicase over raters.
 Members exist in two copies (cross-fitting). Each copy is trained on one half of the raters, and
 tells whom members serve in the other half, and whether they are needed there: whether the set
 predicts raters better with them whom they have not learnt of. Without this, members would confirm
-what they know by heart. When members have settled, those that are needed go on in a third copy,
-which is trained on all answers by the whole recipe; it is the result.
+what they know by heart. When members have settled, those that are needed go on in one copy, which
+learns from all answers.
 """
 
 import warnings
@@ -71,7 +71,7 @@ class NichePOPL:
         self.generator = generator
         self.generation = 0
         self.search, self.settled = _schedule(niches, problem.generations)
-        self.generations = self.settled + problem.generations
+        self.generations = problem.generations
         self.sizes: list[tuple[int, float, float]] = []
         self.specialists = train_specialists(
             problem, popl, most=niches.specialists, generator=generator
@@ -106,8 +106,8 @@ class NichePOPL:
         # A member that serves nobody still needs something: everything, a bit.
         weight = (served[:, comparisons.case] + 1e-9).repeat(self.copies, 1)
         weight = weight * self._trained_on().repeat_interleave(len(self.share), 0)
-        # Held until the members have settled and for half of what follows, then falling to zero.
-        rate = min(1.0, 2 * (self.generations - now) / problem.generations)
+        # Held for half of the generations, then falling to zero.
+        rate = min(1.0, 2 * (1 - now / self.generations))
         self.training.optimizer.param_groups[0]["lr"] = problem.training.learning_rate * rate
         loss = descend(
             problem.loss(self.stack),
@@ -168,7 +168,7 @@ class NichePOPL:
         self._become(nested.order[:needed], born)
 
     def _settle(self) -> None:
-        """Keep the members that are needed, in a third copy that learns of all raters."""
+        """Keep the members that are needed, in one copy that learns of all raters from now on."""
         nested = nested_subsets(self._likelihood(), self.problem.comparisons)
         needed = sufficient_size(nested, evidence=self.settings.evidence)
         if needed >= self.problem.members:
@@ -178,10 +178,9 @@ class NichePOPL:
                 stacklevel=2,
             )
         self._become(nested.order[:needed], [])
-        everything = torch.arange(3 * needed) % (2 * needed)
-        stack = self.stack.subset(everything)
-        self.training = self.training.moved_to(stack, everything)
-        self.stack, self.copies = stack, 3
+        stack = self.stack.subset(range(needed))
+        self.training = self.training.moved_to(stack, range(needed))
+        self.stack, self.copies = stack, 1
         gain = nested.value.diff(dim=0, prepend=nested.value[:1])
         error = gain.std(1, correction=0) / gain.shape[1] ** 0.5
         rows = zip(nested.value.mean(1).tolist(), error.tolist(), strict=True)
@@ -198,13 +197,17 @@ class NichePOPL:
 
     def _told(self, likelihood: Tensor) -> Tensor:
         """Of all copies ``[copies * K, M]``, what the one says that has not learnt of the rater."""
-        first, second = likelihood.chunk(self.copies)[:2]
+        if self.copies == 1:
+            return likelihood
+        first, second = likelihood.chunk(2)
         return torch.where(self.half[self.problem.comparisons.case] == 0, first, second)
 
     def _trained_on(self) -> Tensor:
         """Comparisons that each copy learns from, ``[copies, M]``: of one half, or all."""
         half = self.half[self.problem.comparisons.case]
-        return torch.stack([half, 1 - half, torch.ones_like(half)][: self.copies])
+        if self.copies == 1:
+            return torch.ones_like(half).unsqueeze(0)
+        return torch.stack([half, 1 - half])
 
     def _become(self, kept: Sequence[int], born: Sequence[int]) -> None:
         """Go on with some of the members, and with some specialists beside them, in every copy."""
@@ -235,7 +238,7 @@ class NichePOPL:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from :meth:`state_dict`, bit for bit."""
+        """Continue from `state_dict`, bit for bit."""
         self.generation = int(state["generation"])
         self.copies, count = int(state["copies"]), int(state["count"])
         if count != len(self.stack):
@@ -263,4 +266,5 @@ def _schedule(settings: NicheSettings, generations: int) -> tuple[set[int], int]
     """Generations before which specialists come in, and the one by which members have settled."""
     settled = max(1, round(settings.settled * generations))
     times = range(1, settings.selections + 1)
-    return {max(1, settled * time // (2 * settings.selections)) for time in times}, settled
+    # In the first fifth, so that members that come in have time to show what they are for.
+    return {max(1, settled * time // (5 * settings.selections)) for time in times}, settled

@@ -91,13 +91,13 @@ class NicheSettings:
 
     specialists: int = 256  # raters, at most, for each of whom a specialist may be selected
     selections: int = 1  # times that unneeded members make room for selected specialists
-    settled: float = 0.4  # length of the search, which comes on top, as a share of the generations
+    settled: float = 0.45  # share of the generations after which only needed members are left
     evidence: float = 0.5  # standard errors by which a member has to improve the prediction
 
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
         at.at_least_one(self, "specialists", "selections")
-        at.positive(self, "settled")
+        at.expect(0 < self.settled < 1, "settled", "in (0, 1)", self.settled)
         at.not_negative(self, "evidence")
 
 

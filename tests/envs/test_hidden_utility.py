@@ -299,3 +299,20 @@ def test_all_names_are_known_without_an_import():
     assert set(ONE_D) <= set(registry.names("rater"))
     assert "hidden_utility" in registry.names("env")
     assert all(callable(registry.resolve("rater", name)) for name in ONE_D)
+
+
+def test_places_on_a_ring_and_blends_by_hand():
+    """0.5 + 3/4 wraps to 0.25; a quarter of 0.4 and three quarters of 0.8 are 0.7."""
+    ring = registry.resolve("rater", "ring(3, 4)")
+    one = TensorDict({"observation": torch.tensor([[[0.5]]])}, [1, 1])
+    torch.testing.assert_close(ring(one), torch.tensor([[0.25]]))
+    blend = registry.resolve("rater", "blend(0.25)")
+    two = TensorDict({"observation": torch.tensor([[[0.4, 0.8]]])}, [1, 1])
+    torch.testing.assert_close(blend(two), torch.tensor([[0.7]]))
+    with pytest.raises(ValueError, match="2 coordinates"):
+        blend(one)
+
+
+def test_groups_of_one_function_have_names_of_their_own():
+    groups = make_groups(["ring(0, 2)", "ring(1,2)"], label="return")
+    assert [group.name for group in groups] == ["ring(0,2)", "ring(1,2)"]
