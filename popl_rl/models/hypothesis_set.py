@@ -13,9 +13,19 @@ from torch import Tensor
 
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
+from popl_rl.data.pairs import draw_pairs, starts_of
+from popl_rl.keys import ANSWER, PAIR, Answer
 from popl_rl.models.policies import PolicySpec, build_network
 from popl_rl.models.population import Population
 from popl_rl.models.preference_likelihood import MISTAKE, log_likelihood
+from popl_rl.models.questions import (
+    CANDIDATES,
+    ENOUGH,
+    RULES,
+    Behaviours,
+    Question,
+    best_question,
+)
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.models.scoring import case_values, margins
 from popl_rl.selection.lexicase import lexicase_selection
@@ -143,6 +153,69 @@ class HypothesisSet:
             member = int(lexicase_selection(margin > 0, 1, generator=generator))
             return Catered(member, F.one_hot(torch.tensor(member), len(self)).float())
         raise ValueError(f"method must be 'posterior' or 'lexicase', got {method!r}")
+
+    def next_question(
+        self,
+        segments: TensorDictBase | SegmentBank,
+        answers: TensorDictBase | None = None,
+        *,
+        rule: str = "information_gain",
+        pairs: Tensor | None = None,
+        candidates: int = CANDIDATES,
+        enough: float = ENOUGH,
+        limit: int | None = None,
+        mistake: float = MISTAKE,
+        generator: torch.Generator | None = None,
+    ) -> Question | None:
+        """Choose what to ask one person next; see :mod:`popl_rl.models.questions`.
+
+        Args:
+            segments: What may be asked about. Of a TensorDict with
+                :data:`~popl_rl.keys.START`, only segments from the same start are compared.
+            answers: TensorDict ``[K]`` with ``pair`` and ``answer``, the person's so far; None or
+                empty for none. Nothing is asked twice, ties and skips included.
+            rule: ``"information_gain"``, ``"volume_removal"``, ``"expected_maximum"`` or
+                ``"uniform"``.
+            pairs: Candidates ``[P, 2]``; drawn uniformly if None.
+            candidates: How many to draw.
+            enough: Belief in one behaviour from which on nothing is asked; above 1 for never.
+            limit: Most questions in all; None for no limit.
+            mistake: Chance of a slip, as in :meth:`cater`.
+            generator: Source of the candidates, and of uniform choices.
+
+        Returns:
+            The question; None where enough is known, ``limit`` questions were asked, or no
+            candidate is left.
+
+        Raises:
+            ValueError: If ``rule`` is unknown, ``pairs`` is empty or of another shape,
+                ``candidates`` is not positive, or ``generator`` is needed and missing.
+        """
+        if rule not in (*RULES, "uniform"):
+            raise ValueError(f"rule must be uniform, {', '.join(RULES)}, got {rule!r}")
+        asked = torch.empty(0, 2, dtype=torch.long) if answers is None else answers[PAIR].cpu()
+        if limit is not None and len(asked) >= limit:
+            return None
+        if pairs is None:
+            if candidates < 1:
+                raise ValueError(f"candidates must be at least 1, got {candidates}")
+            if generator is None:
+                raise ValueError("generator must be given to draw candidates; or pass pairs")
+            start = None if isinstance(segments, SegmentBank) else starts_of(segments)
+            pairs = draw_pairs(len(segments), candidates, start=start, generator=generator)
+        elif pairs.ndim != 2 or pairs.shape[1] != 2 or not len(pairs):
+            raise ValueError(f"pairs must have shape [P, 2] with P > 0, got {list(pairs.shape)}")
+        everything = Comparisons(pairs[:, 0], pairs[:, 1], torch.arange(len(pairs)), len(pairs))
+        margin = self._margins(segments, everything).cpu()
+        behaviours = Behaviours(margin, mistake=mistake)
+        weights = torch.full((len(self),), 1 / len(self))
+        if answers is not None and bool((answers[ANSWER] <= Answer.SECOND).any()):
+            weights = self.cater(segments, answers, mistake=mistake).weights
+        same = (pairs.sort(-1).values.unsqueeze(1) == asked.sort(-1).values).all(-1).any(-1)
+        if same.all() or float(behaviours.belief(weights).max()) >= enough:
+            return None
+        index, value = best_question(behaviours, weights, ~same, rule=rule, generator=generator)
+        return Question(pairs[index], value, weights)
 
     def fair(
         self,
