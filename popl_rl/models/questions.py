@@ -12,6 +12,7 @@ Hypotheses that would answer all candidates alike cannot be told apart by any of
 be: they count as one.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -170,6 +171,5 @@ def best_question(
 
 def _entropy(chance: Tensor) -> Tensor:
     """Entropy of a yes or no in bits."""
-    return (torch.special.entr(chance) + torch.special.entr(1 - chance)) / torch.log(
-        chance.new_tensor(2.0)
-    )
+    nats: Tensor = torch.special.entr(chance) + torch.special.entr(1 - chance)
+    return nats / math.log(2)
