@@ -42,8 +42,9 @@ ALLOWED = {
     "envs": {"root", "data", "raters"},
     "configs": set(),
 }
+ALLOWED["web"] = {*ALLOWED["plotting"], "plotting", "selection"}
 ALLOWED["testing"] = {"root", "data", "raters"}
-ALLOWED["trainers"] = {*ALLOWED["experiments"], "experiments", "configs"}
+ALLOWED["trainers"] = {*ALLOWED["experiments"], "experiments", "web", "configs"}
 
 
 def _modules():

@@ -1,8 +1,8 @@
 """Settings, with their defaults and what they mean. Imports neither torch nor TorchRL.
 
 ``data``: environment, raters and segments; ``method``: methods, a section for each part;
-``evaluation``: how the result is evaluated; ``run``: a whole run; ``checks``: how they check
-themselves; ``unread``: settings that the chosen method does not read.
+``evaluation``: how the result is evaluated; ``run``: a whole run; ``pages``: what people answer on;
+``checks``: how they check themselves; ``unread``: settings that the chosen method does not read.
 """
 
 from popl_rl.config.checks import Checker, parse_epsilon
@@ -19,6 +19,13 @@ from popl_rl.config.method import (
     Training,
     VPLSettings,
 )
+from popl_rl.config.pages import (
+    LabelConfig,
+    LabelSettings,
+    PageSettings,
+    ServeConfig,
+    ServeSettings,
+)
 from popl_rl.config.run import Config, EvaluateConfig, LoggerConfig, plain, validate
 from popl_rl.config.unread import unread
 
@@ -32,13 +39,18 @@ __all__ = [
     "EnvConfig",
     "EvaluateConfig",
     "EvaluationConfig",
+    "LabelConfig",
+    "LabelSettings",
     "LoggerConfig",
     "MethodConfig",
     "MixtureSettings",
     "POPLSettings",
+    "PageSettings",
     "RatersConfig",
     "RefinementSettings",
     "ResponseConfig",
+    "ServeConfig",
+    "ServeSettings",
     "Training",
     "VPLSettings",
     "parse_epsilon",

@@ -27,7 +27,15 @@ from popl_rl.raters.response import Response
 from popl_rl.raters.values import with_values
 from popl_rl.storage import load_tensordict, save_tensordict, write_json
 
-__all__ = ["Data", "Reader", "build_groups", "describe", "fresh_segments", "make_data"]
+__all__ = [
+    "Data",
+    "Reader",
+    "build_groups",
+    "describe",
+    "first_segments",
+    "fresh_segments",
+    "make_data",
+]
 
 #: Reads other people's data: path -> segments ``[N, T]`` with ``observation`` and ``action``, and
 #: preferences ``[M]`` with ``pair``, ``answer`` and ``rater``.
@@ -258,6 +266,18 @@ def _check_segments(segments: TensorDictBase, path: Path, config: DataConfig, wo
             f"{path} holds observations of shape {tuple(segments[OBSERVATION].shape[2:])}, "
             f"but the environment gives {expected}; it was collected in another environment"
         )
+
+
+def first_segments(
+    config: DataConfig,
+    world: World,
+    *,
+    seed: int,
+    env: EnvConfig,
+    progress: Callable[[int], None] | None = None,
+) -> TensorDictBase:
+    """The segments that a run of this seed collects for training."""
+    return _collect(config, world, env, stream(seed, "segments"), progress)
 
 
 def fresh_segments(

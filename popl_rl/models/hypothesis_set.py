@@ -73,7 +73,7 @@ class HypothesisSet:
 
     def distinct(self, bank: SegmentBank, comparisons: Comparisons) -> Self:
         """Keep one member for each distinct row of passes ``[M]``, the first with that row."""
-        passes = self._margins(bank, comparisons) > 0
+        passes = self.margins(bank, comparisons) > 0
         inverse = torch.unique(passes, dim=0, return_inverse=True)[1].tolist()
         first = sorted({behaviour: inverse.index(behaviour) for behaviour in inverse}.values())
         return self.subset(first)
@@ -88,7 +88,7 @@ class HypothesisSet:
         p_i Z_ij p_j`` with equal shares p; two members are as similar as the agreement of their
         passes exceeds chance, ``Z = max(0, 2 agreement - 1)``.
         """
-        sign = (self._margins(bank, comparisons) > 0).float() * 2 - 1
+        sign = (self.margins(bank, comparisons) > 0).float() * 2 - 1
         similarity = (sign @ sign.T / sign.shape[1]).clamp(min=0)
         return float(1 / similarity.mean())
 
@@ -97,7 +97,8 @@ class HypothesisSet:
         """Segments as hypotheses of this kind read them."""
         return SegmentBank.from_segments(segments)
 
-    def _margins(self, segments: TensorDictBase | SegmentBank, comparisons: Comparisons) -> Tensor:
+    def margins(self, segments: TensorDictBase | SegmentBank, comparisons: Comparisons) -> Tensor:
+        """Margins of every hypothesis on every comparison, ``[N, M]``; positive is a pass."""
         bank = segments if isinstance(segments, SegmentBank) else self._bank(segments)
         pair = torch.stack([comparisons.preferred, comparisons.other])
         if pair.numel() < len(bank):
@@ -143,7 +144,7 @@ class HypothesisSet:
                 [0, 0.5) or ``generator`` is missing.
         """
         comparisons = Comparisons.from_preferences(answers, cases="preference")
-        margin = self._margins(segments, comparisons).cpu()
+        margin = self.margins(segments, comparisons).cpu()
         if method == "posterior":
             log_weight = log_likelihood(margin, mistake).sum(1)
             return Catered(int(log_weight.argmax()), log_weight.softmax(0))
@@ -206,7 +207,7 @@ class HypothesisSet:
         elif pairs.ndim != 2 or pairs.shape[1] != 2 or not len(pairs):
             raise ValueError(f"pairs must have shape [P, 2] with P > 0, got {list(pairs.shape)}")
         everything = Comparisons(pairs[:, 0], pairs[:, 1], torch.arange(len(pairs)), len(pairs))
-        margin = self._margins(segments, everything).cpu()
+        margin = self.margins(segments, everything).cpu()
         behaviours = Behaviours(margin, mistake=mistake)
         weights = torch.full((len(self),), 1 / len(self))
         if answers is not None and bool((answers[ANSWER] <= Answer.SECOND).any()):
@@ -241,7 +242,7 @@ class HypothesisSet:
         if not 0 <= quantile <= 1:
             raise ValueError(f"quantile must be in [0, 1], got {quantile}")
         comparisons = Comparisons.from_preferences(answers, cases="rater")
-        values = case_values(self._margins(segments, comparisons).cpu() > 0, comparisons)
+        values = case_values(self.margins(segments, comparisons).cpu() > 0, comparisons)
         return int(values.quantile(quantile, dim=1).argmax())
 
     def save(self, path: Path | str) -> None:

@@ -114,7 +114,7 @@ def test_the_next_question_is_the_best_of_the_candidates(policies, segments, ban
     so_far = said([[2, 3]], [1])
     asked = policies.next_question(segments, so_far, pairs=pairs, enough=2.0)
     comparisons = Comparisons.from_preferences(said(pairs.tolist(), [0] * 5), cases="preference")
-    behaviours = Behaviours(policies._margins(bank, comparisons))
+    behaviours = Behaviours(policies.margins(bank, comparisons))
     weights = policies.cater(segments, so_far).weights
     torch.testing.assert_close(asked.weights, weights)
     values = behaviours.values(weights, "information_gain")

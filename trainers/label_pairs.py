@@ -1,0 +1,160 @@
+"""Have people compare clips on a page: ``popl-label``.
+
+popl-label out=labels                                        # makes segments of two doors first
+popl-label data.load=runs/mine/data out=labels
+popl-label data.load=runs/mine/data out=labels label.pairs=disagreement \\
+    label.policies=runs/mine/policies
+popl-train data.load=labels evaluation.baselines=false       # trains on what people said
+
+The page says which of two clips is better, by buttons or keys; ``out`` holds the segments, clips
+and answers, and the same command goes on where it was stopped.
+"""
+
+import secrets
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import hydra
+
+from popl_rl.config import LabelConfig, plain, validate
+from popl_rl.trainers.command import register_schemas, run_command
+
+if TYPE_CHECKING:
+    from starlette.applications import Starlette
+
+    from popl_rl.web.label_store import LabelStore
+    from popl_rl.web.server import Address
+
+
+@dataclass(frozen=True)
+class Labelling:
+    """A page that is ready to run.
+
+    Attributes:
+        app: The application.
+        store: Raters and answers.
+        address: Where it listens.
+        export: Writes answers as data to train on.
+        key: Word that visitors need; None for none.
+    """
+
+    app: "Starlette"
+    store: "LabelStore"
+    address: "Address"
+    export: Callable[[], int]
+    key: str | None
+
+
+def prepare(config: LabelConfig) -> Labelling:
+    """Everything up to the first visitor: segments, pairs, clips, page.
+
+    Raises:
+        ValueError: If settings are off or do not go together.
+    """
+    config = plain(config)
+    validate(config)
+    from popl_rl.web.server import listen, require_extra
+
+    require_extra()
+    from popl_rl.experiments.label_data import gather_segments
+    from popl_rl.experiments.loggers import Progress
+    from popl_rl.models.sets import load_set
+    from popl_rl.randomness import stream
+    from popl_rl.storage import load_tensordict
+    from popl_rl.web.guards import guards, hosts_of
+    from popl_rl.web.label_app import LabelPages
+    from popl_rl.web.label_store import LabelStore
+    from popl_rl.web.labels import choose_pairs, export, kept_pairs
+    from popl_rl.web.pages import Pages
+    from popl_rl.web.rendering import Scenes, segment_clips
+
+    options, out = config.label, Path(config.out)
+    address = listen(config.page.host, config.page.port)
+
+    # 1. Segments, and which pairs of them.
+    with Progress("segments", total=config.data.segments) as progress:
+        seed = gather_segments(
+            config.data, config.env, out, seed=config.seed, progress=progress.update
+        )
+    segments = load_tensordict(out / "segments")
+    segments.auto_batch_size_(2)
+    chosen = None
+    if not (out / "pairs.json").exists():
+        policies = None if options.policies is None else load_set(options.policies)
+        chosen = choose_pairs(
+            segments,
+            options.pairs,
+            count=options.count,
+            policies=policies,
+            generator=stream(config.seed, "label pairs"),
+        )
+    pairs = kept_pairs(out / "pairs.json", chosen)
+
+    # 2. What people see of them.
+    wanted = sorted({segment for pair in pairs for segment in pair})
+    with Progress("clips", total=len(wanted)) as progress:
+        scenes = Scenes(config.env, out, out / "clips", seed)
+        clips = segment_clips(scenes, wanted, progress=progress.update)
+
+    # 3. The page.
+    store = LabelStore(
+        out / "answers.sqlite",
+        pairs,
+        raters_per_pair=options.raters_per_pair,
+        answers=options.answers,
+        attention=options.attention,
+    )
+    text = options.instructions
+    pages = LabelPages(
+        store,
+        Pages(clips, language=config.page.language),
+        instructions=None if text is None else Path(text).read_text(encoding="utf-8"),
+        pause=options.pause,
+    )
+    key = config.page.key or (secrets.token_urlsafe(9) if address.is_public else None)
+    guard = guards(
+        hosts=hosts_of(config.page.host),
+        key=key,
+        rate=config.page.rate,
+        newcomers=config.page.newcomers,
+    )
+    return Labelling(pages.app(guard), store, address, lambda: export(store, out), key)
+
+
+def run(config: LabelConfig) -> None:
+    """Serve the page until Ctrl-C; answers become data every few seconds."""
+    labelling = prepare(config)
+    from popl_rl.web.server import regularly, run
+
+    place = labelling.address.url + ("" if labelling.key is None else f"?key={labelling.key}")
+    who = "anybody who can reach it" if labelling.address.is_public else "this machine alone"
+    print(f"compare clips at {place} ({who}); Ctrl-C ends it", flush=True)
+    with regularly(labelling.export, seconds=5):
+        run(labelling.app, labelling.address)
+    answers = len(labelling.store.given())
+    labelling.store.database.close()
+    print(f"{answers} answers in {config.out}: popl-train data.load={config.out}")
+
+
+register_schemas()
+
+
+@hydra.main(version_base="1.3", config_path="pkg://popl_rl.configs", config_name="label")
+def main(cfg: Any) -> None:
+    """Hydra's entry."""
+    config: LabelConfig = plain(cfg)
+    validate(config)
+    sys.stderr.write(f"label {config.env.factory}: loading PyTorch\n")
+    run(config)
+
+
+def cli() -> None:
+    """Console command ``popl-label``."""
+    run_command(main)
+
+
+if __name__ == "__main__":
+    cli()
