@@ -163,7 +163,7 @@ class TwoDoors(MiniGridEnv):
         for state in [int(segment[INFO, "state"][0]), *segment[INFO, "next_state"].tolist()]:
             x, y, self.agent_dir = self.states[state]
             self.agent_pos = (x, y)
-            frames.append(self.get_frame(highlight=False))
+            frames.append(self.get_frame(highlight=False, tile_size=24))
         return frames
 
     def transition_table(self) -> Table:

@@ -2,8 +2,7 @@
 
 popl-label out=labels                                        # makes segments of two doors first
 popl-label data.load=runs/mine/data out=labels
-popl-label data.load=runs/mine/data out=labels label.pairs=disagreement \\
-    label.policies=runs/mine/policies
+popl-label out=labels label.pairs=disagreement label.policies=runs/mine/policies
 popl-train data.load=labels evaluation.baselines=false       # trains on what people said
 
 The page says which of two clips is better, by buttons or keys; ``out`` holds the segments, clips

@@ -11,7 +11,7 @@ import secrets
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import hydra
 from omegaconf import OmegaConf
@@ -21,8 +21,10 @@ from popl_rl.trainers.command import register_schemas, run_command
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
+    from tensordict import TensorDictBase
 
     from popl_rl.data.environments import World
+    from popl_rl.models.hypothesis_set import HypothesisSet
     from popl_rl.web.catering import Caterer
     from popl_rl.web.clips import Clips
     from popl_rl.web.numbers import Number
@@ -118,7 +120,7 @@ def _caterer(config: ServeConfig, run_dir: Path, world: "World") -> "Caterer":
         policies,
         read,
         pairs,
-        fair=policies.fair(read, load_tensordict(data / "preferences")),
+        everybody=_everybody(run_dir, policies, read),
         store=PersonStore(run_dir / "served" / "answers.sqlite"),
         questions=options.questions,
         enough=options.enough,
@@ -128,10 +130,10 @@ def _caterer(config: ServeConfig, run_dir: Path, world: "World") -> "Caterer":
 
 @dataclass(frozen=True)
 class Show:
-    """What people see: clips, those of each member, and what each does."""
+    """What people see: clips; those of each member, and of the one for all (None); numbers."""
 
     clips: "Clips"
-    of_member: dict[int, list[int]]
+    of_member: dict[int | None, list[int]]
     numbers: list["Number"]
 
 
@@ -141,6 +143,7 @@ def _shown(
     """Clips of the segments and of what each member does, or likes best if it cannot act."""
     from popl_rl.experiments.loggers import Progress
     from popl_rl.models.policy_set import PolicySet
+    from popl_rl.web.clips import Clip
     from popl_rl.web.numbers import policy_numbers
     from popl_rl.web.rendering import Scenes, policy_clips, segment_clips
 
@@ -150,18 +153,47 @@ def _shown(
     with Progress("clips", total=len(wanted)) as progress:
         scenes = Scenes(stored.env, run_dir / "data", folder / "clips", seed)
         clips = dict(segment_clips(scenes, wanted, progress=progress.update))
-    of_member = {member: caterer.favourites(member) for member in range(len(policies))}
+    of_member: dict[int | None, list[int]] = {None: caterer.favourites(None)}
+    of_member |= {member: caterer.favourites(member) for member in range(len(policies))}
     if not isinstance(policies, PolicySet):
         return Show(clips, of_member, [])
-    scenes = Scenes(stored.env, _place(run_dir), folder / "policies", config.seed)
-    with Progress("policies", total=len(policies)) as progress:
-        acted = policy_clips(scenes, range(len(policies)), progress=progress.update)
+    alone = folder / "everybody"
+    if not alone.exists():
+        caterer.everybody.save(alone)
     behind = 1 + max(wanted)  # numbers that no segment has
-    clips |= {behind + member: clip for member, clip in acted.items()}
-    of_member |= {member: [behind + member] for member in acted}
-    episodes = config.serve.episodes
-    numbers = policy_numbers(policies, world, stored.env, episodes=episodes, seed=config.seed)
+    with Progress("policies", total=len(policies)) as progress:
+        scenes = Scenes(stored.env, _place(run_dir), folder / "policies", config.seed)
+        acted: dict[int | None, Clip] = dict(
+            policy_clips(scenes, range(len(policies)), progress=progress.update).items()
+        )
+        scenes = Scenes(stored.env, alone, folder / "clip-for-everybody", config.seed)
+        acted[None] = policy_clips(scenes, [0])[0]
+    for place, (member, clip) in enumerate(acted.items()):
+        clips[behind + place], of_member[member] = clip, [behind + place]
+    numbers = policy_numbers(
+        policies,
+        cast("PolicySet", caterer.everybody),
+        world,
+        stored.env,
+        episodes=config.serve.episodes,
+        seed=config.seed,
+    )
     return Show(clips, of_member, numbers)
+
+
+def _everybody(
+    run_dir: Path, policies: "HypothesisSet", segments: "TensorDictBase"
+) -> "HypothesisSet":
+    """The hypothesis for everybody: trained on all answers, or else the fair one of the set."""
+    from popl_rl.models.sets import load_set
+    from popl_rl.storage import load_tensordict
+
+    if (run_dir / "baselines").is_dir():
+        pooled = load_set(run_dir / "baselines").subset([0])
+        if type(pooled) is type(policies):
+            return pooled
+    preferences = load_tensordict(run_dir / "data" / "preferences")
+    return policies.subset([policies.fair(segments, preferences)])
 
 
 def _place(run_dir: Path) -> Path:

@@ -61,11 +61,11 @@ class Found:
 
 @dataclass(frozen=True)
 class Agreement:
-    """With how many strict answers members agree.
+    """With how many strict answers hypotheses agree.
 
     Attributes:
         own: The person's member.
-        everybody: The member for everybody.
+        everybody: The one for everybody.
         strict: Strict answers.
     """
 
@@ -81,7 +81,7 @@ class Caterer:
         policies: The set.
         segments: What is asked about, ``[N, T]``, as learners read them.
         pairs: Candidates ``[P, 2]``.
-        fair: Member for everybody.
+        everybody: A single hypothesis, the one for everybody.
         store: People and their answers.
         questions: Most questions of a person.
         enough: Belief in one behaviour from which on nothing is asked.
@@ -94,13 +94,13 @@ class Caterer:
         segments: TensorDictBase,
         pairs: Tensor,
         *,
-        fair: int,
+        everybody: HypothesisSet,
         store: PersonStore,
         questions: int,
         enough: float,
         further: int,
     ) -> None:
-        self.policies, self.fair, self.store = policies, fair, store
+        self.policies, self.everybody, self.store = policies, everybody, store
         self.questions, self.enough, self.further = questions, enough, further
         # Each pair once: what was asked is then known by its place.
         self.pairs = pairs.sort(-1).values.unique(dim=0)
@@ -108,12 +108,13 @@ class Caterer:
         self._row = {int(segment): row for row, segment in enumerate(used.tolist())}
         self._used, self._segments = used, segments[used]
         every = Comparisons(
-            torch.searchsorted(used, self.pairs[:, 0]),
-            torch.searchsorted(used, self.pairs[:, 1]),
+            torch.searchsorted(used, self.pairs[:, 0].contiguous()),
+            torch.searchsorted(used, self.pairs[:, 1].contiguous()),
             torch.arange(len(self.pairs)),
             len(self.pairs),
         )
         self.margin = policies.margins(self._segments, every).cpu()
+        self._for_all = everybody.margins(self._segments, every).cpu()[0]
         self.behaviours = Behaviours(self.margin)
         self._place = {(a, b): place for place, (a, b) in enumerate(self.pairs.tolist())}
 
@@ -175,10 +176,10 @@ class Caterer:
             if one.further != further or one.answer not in (Answer.FIRST, Answer.SECOND):
                 continue
             low, high = sorted((one.first, one.second))
-            margin = self.margin[:, self._place[low, high]]
+            place = self._place[low, high]
             prefers_low = (one.answer == Answer.FIRST) == (one.first == low)
-            own += bool((margin[member] > 0) == prefers_low)
-            everybody += bool((margin[self.fair] > 0) == prefers_low)
+            own += bool(self.margin[member, place] > 0) == prefers_low
+            everybody += bool(self._for_all[place] > 0) == prefers_low
             strict += 1
         return Agreement(own, everybody, strict)
 
@@ -188,15 +189,16 @@ class Caterer:
         served = self.store.serve(person, found.member, float(found.weights[found.member]))
         return Found(found.weights, served.member, True)
 
-    def favourites(self, member: int, *, count: int = 3) -> list[int]:
-        """Segments of the candidates that a member likes best, the best first.
+    def favourites(self, member: int | None, *, count: int = 3) -> list[int]:
+        """Segments of the candidates that a member, or the one for all (None), likes best.
 
         Those that win most of their comparisons with others, by the member's margins.
         """
         wins = torch.zeros(len(self._used))
         times = torch.zeros(len(self._used))
         places = torch.searchsorted(self._used, self.pairs)
-        first = (self.margin[member] > 0).float()
+        margin = self._for_all if member is None else self.margin[member]
+        first = (margin > 0).float()
         for side, won in ((0, first), (1, 1 - first)):
             wins.index_add_(0, places[:, side], won)
             times.index_add_(0, places[:, side], torch.ones(len(won)))
@@ -217,7 +219,7 @@ class Caterer:
             later = None if member is None else self.agreement(asked, member, further=True)
             row["later_answers"] = 0 if later is None else later.strict
             row["agree"] = 0 if later is None else later.own
-            row["agree_fair"] = 0 if later is None else later.everybody
+            row["agree_everybody"] = 0 if later is None else later.everybody
             rows.append(row)
         return rows
 

@@ -26,7 +26,7 @@ from popl_rl.storage import write_atomic
 __all__ = ["Clip", "Clips", "film_strip", "read_clip", "write_clip"]
 
 _MOST_FRAMES = 48
-_SIDE = 240  # pixels of a frame's longer side at most
+_SIDE = 320  # pixels of a frame's longer side at most
 _QUALITY = 85  # of WebP
 
 Frame = NDArray[np.uint8]
@@ -73,7 +73,7 @@ def film_strip(frames: Sequence[Frame], *, rate: float) -> Clip:
     smaller = -(-max(kept[0].shape[:2]) // _SIDE)
     strip = np.concatenate([_shrunk(frame, smaller) for frame in kept], axis=1)
     file = io.BytesIO()
-    imageio.v3.imwrite(file, strip, extension=".webp", quality=_QUALITY)
+    imageio.v3.imwrite(file, strip, extension=".webp", quality=_QUALITY, method=2)
     return Clip(len(kept), rate / every, file.getvalue())
 
 

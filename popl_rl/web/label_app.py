@@ -103,7 +103,7 @@ class LabelPages:
             kept = await run_in_threadpool(self.store.answer, rater, position, answer, seconds)
         except (KeyError, OverflowError) as error:
             raise HTTPException(409, "that is none of your questions") from error
-        if kept and self.pause:
+        if kept and self.pause and not self.store.is_check(rater, position):
             done = await run_in_threadpool(self.store.answered, rater)
             if done % self.pause == 0 and 0 < done < self.store.answers:
                 return see("/pause")

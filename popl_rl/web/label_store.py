@@ -140,6 +140,11 @@ class LabelStore:
         assert found is not None
         return int(found[0])
 
+    def is_check(self, rater: Rater, position: int) -> bool:
+        """Whether a question of a rater is an attention check."""
+        query = "SELECT pair FROM question WHERE rater = ? AND position = ?"
+        return self.database.one(query, [rater.id, position]) == (ATTENTION,)
+
     def question(self, rater: Rater) -> LabelQuestion | None:
         """What a rater is to be asked now, the same until it is answered; None if nothing is left.
 

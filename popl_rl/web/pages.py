@@ -146,18 +146,19 @@ def see(path: str, *, visitor: str | None = None) -> Response:
 
 
 async def form(request: Request) -> Mapping[str, str]:
-    """Fields of a form that was sent as ``application/x-www-form-urlencoded``.
+    """Fields of a form that was sent as ``application/x-www-form-urlencoded``; none of no body.
 
     Raises:
         HTTPException: With 400, if it was not, or cannot be read.
     """
+    body = await request.body()
+    if not body:
+        return {}
     kind = request.headers.get("content-type", "").partition(";")[0].strip()
     if kind != "application/x-www-form-urlencoded":
         raise HTTPException(400, "expected a form")
     try:
-        fields = parse_qs(
-            (await request.body()).decode(), keep_blank_values=True, max_num_fields=20
-        )
+        fields = parse_qs(body.decode(), keep_blank_values=True, max_num_fields=20)
     except ValueError as error:
         raise HTTPException(400, f"a form that cannot be read: {error}") from error
     return {name: values[-1] for name, values in fields.items()}

@@ -11,9 +11,9 @@
     takes ``{"position": 1, "answer": "first", "seconds": 2.5}``, answer out of ``first second tie
     skip``; answers as ``/api/next`` does, which then has the next question.
 ``GET /api/policy``
-    ``{"member": 1, "belief": 0.97, "fair": 0, "agrees": 4, "strict": 5, "clips": [...],
-    "numbers": [{"name": "m_success", "about": {}, "own": 0.98, "everybody": 0.4}]}``; 409 before
-    enough is known.
+    ``{"member": 1, "belief": 0.97, "agrees": 4, "strict": 5, "clips": [...], "everybody":
+    [...], "numbers": [{"name": "m_success", "about": {}, "own": 0.98, "everybody": 0.4}]}``;
+    409 before enough is known.
 
 What goes wrong is ``{"error": "..."}``: 400 for what cannot be read, 401 without a token that is
 known, 409 for a question that is none of this person's, 413, 421, 429 as for pages.
@@ -42,7 +42,7 @@ __all__ = ["api_routes"]
 def api_routes(
     caterer: Caterer,
     numbers: Sequence[Number],
-    shows: Callable[[int], Sequence[int]],
+    shows: Callable[[int | None], Sequence[int]],
     clips: Clips,
 ) -> list[Route]:
     """Routes of the interface.
@@ -67,7 +67,7 @@ class _Interface:
         self,
         caterer: Caterer,
         numbers: Sequence[Number],
-        shows: Callable[[int], Sequence[int]],
+        shows: Callable[[int | None], Sequence[int]],
         clips: Clips,
     ) -> None:
         self.caterer, self.numbers, self.shows, self.clips = caterer, numbers, shows, clips
@@ -110,16 +110,16 @@ class _Interface:
             {
                 "member": served.member,
                 "belief": served.belief,
-                "fair": caterer.fair,
                 "agrees": agreed.own,
                 "strict": agreed.strict,
                 "clips": self._clips(self.shows(served.member)),
+                "everybody": self._clips(self.shows(None)),
                 "numbers": [
                     {
                         "name": number.phrase,
                         "about": dict(number.about),
                         "own": _finite(number.values[served.member]),
-                        "everybody": _finite(number.values[caterer.fair]),
+                        "everybody": _finite(number.everybody),
                     }
                     for number in self.numbers
                 ],

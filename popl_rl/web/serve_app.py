@@ -18,6 +18,7 @@ import csv
 import hmac
 import io
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -45,7 +46,7 @@ class ServePages:
     Args:
         caterer: Finds policies.
         pages: Templates and clips.
-        shows: Member -> numbers of the clips that show it; none if nothing does.
+        shows: Member -> numbers of the clips that show it; None -> of the one for everybody.
         numbers: What each policy does.
         word: Word that opens the researcher's page.
     """
@@ -55,7 +56,7 @@ class ServePages:
         caterer: Caterer,
         pages: Pages,
         *,
-        shows: Callable[[int], Sequence[int]],
+        shows: Callable[[int | None], Sequence[int]],
         numbers: Sequence[Number],
         word: str,
     ) -> None:
@@ -95,9 +96,8 @@ class ServePages:
             questions=self.caterer.questions,
         )
 
-    async def start(self, request: Request) -> Response:
+    async def start(self, _request: Request) -> Response:
         """Somebody new."""
-        await form(request)
         person = await run_in_threadpool(self.store.begin)
         return see("/find", visitor=person.token)
 
@@ -157,14 +157,13 @@ class ServePages:
             request,
             "serve_policy",
             member=served.member,
-            fair=self.caterer.fair,
             percent=round(100 * served.belief),
             suits=served.suits,
             bars=self._bars(found),
             answers=sum(one.answer is not None for one in first),
             agreed=self.caterer.agreement(asked, served.member, further=False),
             own=self.shows(served.member),
-            everybody=self.shows(self.caterer.fair),
+            everybody=self.shows(None),
             numbers=self.numbers,
             further=self.caterer.further,
         )
@@ -217,9 +216,14 @@ class ServePages:
         return Response(file.getvalue(), media_type="text/csv")
 
     async def as_json(self, request: Request) -> Response:
-        """The same as JSON."""
+        """The same as JSON, with every question and answer."""
         self._require_word(request)
-        return JSONResponse(await run_in_threadpool(self.caterer.rows))
+        rows = await run_in_threadpool(self.caterer.rows)
+        people = await run_in_threadpool(self.store.people)
+        for row, (person, _) in zip(rows, people, strict=False):
+            asked = await run_in_threadpool(self.store.asked, person)
+            row["asked"] = [asdict(one) for one in asked]
+        return JSONResponse(rows)
 
     def _require_word(self, request: Request) -> None:
         given = request.query_params.get("pass", "")
