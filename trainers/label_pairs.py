@@ -13,6 +13,7 @@ import secrets
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ from popl_rl.trainers.command import register_schemas, run_command
 if TYPE_CHECKING:
     from starlette.applications import Starlette
 
+    from popl_rl.web.clips import Clips
     from popl_rl.web.label_store import LabelStore
     from popl_rl.web.server import Address
 
@@ -58,47 +60,15 @@ def prepare(config: LabelConfig) -> Labelling:
     from popl_rl.web.server import listen, require_extra
 
     require_extra()
-    from popl_rl.experiments.label_data import gather_segments
-    from popl_rl.experiments.loggers import Progress
-    from popl_rl.models.sets import load_set
-    from popl_rl.randomness import stream
-    from popl_rl.storage import load_tensordict
     from popl_rl.web.guards import guards, hosts_of
     from popl_rl.web.label_app import LabelPages
     from popl_rl.web.label_store import LabelStore
-    from popl_rl.web.labels import choose_pairs, export, kept_pairs
+    from popl_rl.web.labels import export
     from popl_rl.web.pages import Pages
-    from popl_rl.web.rendering import Scenes, segment_clips
 
     options, out = config.label, Path(config.out)
     address = listen(config.page.host, config.page.port)
-
-    # 1. Segments, and which pairs of them.
-    with Progress("segments", total=config.data.segments) as progress:
-        seed = gather_segments(
-            config.data, config.env, out, seed=config.seed, progress=progress.update
-        )
-    segments = load_tensordict(out / "segments")
-    segments.auto_batch_size_(2)
-    chosen = None
-    if not (out / "pairs.json").exists():
-        policies = None if options.policies is None else load_set(options.policies)
-        chosen = choose_pairs(
-            segments,
-            options.pairs,
-            count=options.count,
-            policies=policies,
-            generator=stream(config.seed, "label pairs"),
-        )
-    pairs = kept_pairs(out / "pairs.json", chosen)
-
-    # 2. What people see of them.
-    wanted = sorted({segment for pair in pairs for segment in pair})
-    with Progress("clips", total=len(wanted)) as progress:
-        scenes = Scenes(config.env, out, out / "clips", seed)
-        clips = segment_clips(scenes, wanted, progress=progress.update)
-
-    # 3. The page.
+    pairs, clips = _material(config, out)
     store = LabelStore(
         out / "answers.sqlite",
         pairs,
@@ -121,6 +91,38 @@ def prepare(config: LabelConfig) -> Labelling:
         newcomers=config.page.newcomers,
     )
     return Labelling(pages.app(guard), store, address, lambda: export(store, out), key)
+
+
+def _material(config: LabelConfig, out: Path) -> tuple[list[tuple[int, int]], "Clips"]:
+    """Which pairs are compared, and what people see of them."""
+    from popl_rl.data.environments import build_world
+    from popl_rl.experiments.label_data import gather_segments
+    from popl_rl.experiments.loggers import Progress
+    from popl_rl.models.sets import load_set
+    from popl_rl.randomness import stream
+    from popl_rl.storage import load_tensordict
+    from popl_rl.web.labels import choose_pairs, kept_pairs
+    from popl_rl.web.rendering import Scenes, segment_clips
+
+    options, env = config.label, config.env
+    with Progress("segments", total=config.data.segments) as progress:
+        seed = gather_segments(config.data, env, out, seed=config.seed, progress=progress.update)
+    chosen = None
+    if not (out / "pairs.json").exists():
+        segments = load_tensordict(out / "segments")
+        segments.auto_batch_size_(2)
+        chosen = choose_pairs(
+            segments,
+            options.pairs,
+            count=options.count,
+            policies=None if options.policies is None else load_set(options.policies),
+            generator=stream(config.seed, "label pairs"),
+        )
+    pairs = kept_pairs(out / "pairs.json", chosen)
+    wanted = sorted({segment for pair in pairs for segment in pair})
+    with Progress("clips", total=len(wanted)) as progress:
+        scenes = Scenes(partial(build_world, env), out, out / "clips", seed)
+        return pairs, segment_clips(scenes, wanted, progress=progress.update)
 
 
 def run(config: LabelConfig) -> None:

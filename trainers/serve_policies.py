@@ -9,7 +9,8 @@ suits. The run's folder gets ``served/`` with the answers and clips.
 
 import secrets
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -141,17 +142,19 @@ def _shown(
     config: ServeConfig, stored: Config, run_dir: Path, caterer: "Caterer", world: "World"
 ) -> Show:
     """Clips of the segments and of what each member does, or likes best if it cannot act."""
+    from popl_rl.data.environments import build_world
     from popl_rl.experiments.loggers import Progress
     from popl_rl.models.policy_set import PolicySet
     from popl_rl.web.clips import Clip
     from popl_rl.web.numbers import policy_numbers
     from popl_rl.web.rendering import Scenes, policy_clips, segment_clips
 
-    policies, folder = caterer.policies, run_dir / "served"
+    policies, folder, env = caterer.policies, run_dir / "served", stored.env
+    make_world = partial(build_world, env)
     seed = stored.seed if stored.data.seed is None else stored.data.seed
     wanted = caterer.pairs.unique().tolist()
     with Progress("clips", total=len(wanted)) as progress:
-        scenes = Scenes(stored.env, run_dir / "data", folder / "clips", seed)
+        scenes = Scenes(make_world, run_dir / "data", folder / "clips", seed)
         clips = dict(segment_clips(scenes, wanted, progress=progress.update))
     of_member: dict[int | None, list[int]] = {None: caterer.favourites(None)}
     of_member |= {member: caterer.favourites(member) for member in range(len(policies))}
@@ -162,20 +165,25 @@ def _shown(
         caterer.everybody.save(alone)
     behind = 1 + max(wanted)  # numbers that no segment has
     with Progress("policies", total=len(policies)) as progress:
-        scenes = Scenes(stored.env, _place(run_dir), folder / "policies", config.seed)
+        scenes = Scenes(
+            make_world, _place(run_dir), folder / "policies", config.seed, env.max_steps
+        )
         acted: dict[int | None, Clip] = dict(
             policy_clips(scenes, range(len(policies)), progress=progress.update).items()
         )
-        scenes = Scenes(stored.env, alone, folder / "clip-for-everybody", config.seed)
+        scenes = replace(scenes, source=alone, folder=folder / "clip-for-everybody")
         acted[None] = policy_clips(scenes, [0])[0]
     for place, (member, clip) in enumerate(acted.items()):
         clips[behind + place], of_member[member] = clip, [behind + place]
     numbers = policy_numbers(
         policies,
         cast("PolicySet", caterer.everybody),
-        world,
-        stored.env,
+        world.make,
+        success=env.success,
+        door=env.door,
+        measured=env.measured,
         episodes=config.serve.episodes,
+        max_steps=env.max_steps,
         seed=config.seed,
     )
     return Show(clips, of_member, numbers)

@@ -22,13 +22,16 @@ class Database:
         schema: Statements that make the tables unless they are there.
         form: What the file says of itself; another server's file is refused.
 
+    Attributes:
+        lock: Held by whoever reads or writes.
+
     Raises:
         ValueError: If the file is no database, or of another form.
     """
 
     def __init__(self, path: Path, schema: str, *, form: str) -> None:
         self.path = path
-        self._lock = threading.RLock()
+        self.lock = threading.RLock()
         # Transactions are ours (isolation_level=None), and the lock makes threads take turns.
         self._connection = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
         try:
@@ -54,7 +57,7 @@ class Database:
     @contextmanager
     def writing(self) -> Iterator[None]:
         """A transaction: all of it is on disk when the block ends, or none of it."""
-        with self._lock:
+        with self.lock:
             self._connection.execute("BEGIN IMMEDIATE")
             try:
                 yield
@@ -65,12 +68,12 @@ class Database:
 
     def run(self, statement: str, values: Sequence[Any] = ()) -> int:
         """Run a statement inside of :meth:`writing`; returns the number of the row it made."""
-        with self._lock:
+        with self.lock:
             return int(self._connection.execute(statement, values).lastrowid or 0)
 
     def all(self, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """Rows of a query."""
-        with self._lock:
+        with self.lock:
             return self._connection.execute(query, values).fetchall()
 
     def one(self, query: str, values: Sequence[Any] = ()) -> tuple[Any, ...] | None:
@@ -80,5 +83,5 @@ class Database:
 
     def close(self) -> None:
         """Close the file."""
-        with self._lock:
+        with self.lock:
             self._connection.close()

@@ -63,11 +63,13 @@ class LabelPages:
             exception_handlers={HTTPException: self.pages.problem, 500: self.pages.problem},
         )
 
-    async def begin(self, request: Request) -> Response:
+    def begin(self, request: Request) -> Response:
         """Instructions."""
-        known = await self._rater(request)
         return self.pages.show(
-            request, "label_begin", instructions=self.instructions, known=known is not None
+            request,
+            "label_begin",
+            instructions=self.instructions,
+            known=self._rater(request) is not None,
         )
 
     async def start(self, request: Request) -> Response:
@@ -76,75 +78,80 @@ class LabelPages:
         rater = await run_in_threadpool(self.store.begin, name)
         return see("/label", visitor=rater.token)
 
-    async def label(self, request: Request) -> Response:
+    def label(self, request: Request) -> Response:
         """The question that is open."""
-        rater = await self._rater(request)
+        rater = self._rater(request)
         if rater is None:
             return see("/")
-        question = await run_in_threadpool(self.store.question, rater)
+        question = self.store.question(rater)
         if question is None:
             return see("/done")
-        done = await run_in_threadpool(self.store.answered, rater)
         total = min(self.store.answers, len(self.store.pairs))
+        done = self.store.answered(rater)
         return self.pages.show(
             request, "label", question=question, done=done, total=total, rater=rater
         )
 
     async def answer(self, request: Request) -> Response:
         """Keep an answer."""
-        rater = await self._known(request)
         said = await form(request)
         try:
             position = int(said.get("position", ""))
         except ValueError as error:
             raise HTTPException(400, "position must be a number") from error
         answer, seconds = answer_of(said.get("answer")), seconds_of(said.get("seconds"))
+        return await run_in_threadpool(self._keep, request, position, answer, seconds)
+
+    def _keep(
+        self, request: Request, position: int, answer: int, seconds: float | None
+    ) -> Response:
+        rater = self._known(request)
         try:
-            kept = await run_in_threadpool(self.store.answer, rater, position, answer, seconds)
+            kept = self.store.answer(rater, position, answer, seconds)
         except (KeyError, OverflowError) as error:
             raise HTTPException(409, "that is none of your questions") from error
         if kept and self.pause and not self.store.is_check(rater, position):
-            done = await run_in_threadpool(self.store.answered, rater)
-            if done % self.pause == 0 and 0 < done < self.store.answers:
+            done = self.store.answered(rater)
+            if done % self.pause == 0 and done < self.store.answers:
                 return see("/pause")
         return see("/label")
 
     async def undo(self, request: Request) -> Response:
         """Take the last answer back."""
-        await run_in_threadpool(self.store.undo, await self._known(request))
+        await run_in_threadpool(lambda: self.store.undo(self._known(request)))
         return see("/label")
 
-    async def rest(self, request: Request) -> Response:
+    def rest(self, request: Request) -> Response:
         """A pause."""
-        rater = await self._rater(request)
+        rater = self._rater(request)
         if rater is None:
             return see("/")
-        done = await run_in_threadpool(self.store.answered, rater)
+        done = self.store.answered(rater)
         return self.pages.show(request, "label_pause", done=done, rater=rater)
 
-    async def done(self, request: Request) -> Response:
+    def done(self, request: Request) -> Response:
         """Thanks."""
-        rater = await self._rater(request)
+        rater = self._rater(request)
         if rater is None:
             return see("/")
-        if await run_in_threadpool(self.store.question, rater) is not None:
+        if self.store.question(rater) is not None:
             return see("/label")
-        done = await run_in_threadpool(self.store.answered, rater)
+        done = self.store.answered(rater)
         return self.pages.show(request, "label_done", rater=rater, done=done)
 
-    async def back(self, request: Request) -> Response:
+    def back(self, request: Request) -> Response:
         """Go on as an earlier rater."""
-        rater = await run_in_threadpool(self.store.rater, request.query_params.get("rater", ""))
+        rater = self.store.rater(request.query_params.get("rater", ""))
         if rater is None:
             raise HTTPException(404, "there is no such rater")
         return see("/label", visitor=rater.token)
 
-    async def _rater(self, request: Request) -> Rater | None:
+    def _rater(self, request: Request) -> Rater | None:
         token = request.cookies.get(VISITOR_COOKIE, "")
-        return await run_in_threadpool(self.store.rater, token) if token else None
+        return self.store.rater(token) if token else None
 
-    async def _known(self, request: Request) -> Rater:
-        rater = await self._rater(request)
+    def _known(self, request: Request) -> Rater:
+        rater = self._rater(request)
         if rater is None:
             raise HTTPException(409, "begin on the first page")
         return rater

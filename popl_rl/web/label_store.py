@@ -3,6 +3,7 @@
 import random
 import secrets
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +25,6 @@ CREATE TABLE IF NOT EXISTS question (
   rater INTEGER NOT NULL, position INTEGER NOT NULL, pair INTEGER NOT NULL,
   first INTEGER NOT NULL, second INTEGER NOT NULL, expected INTEGER, asked REAL NOT NULL,
   PRIMARY KEY (rater, position));
-CREATE INDEX IF NOT EXISTS question_pair ON question (pair);
 CREATE TABLE IF NOT EXISTS answer (
   id INTEGER PRIMARY KEY, rater INTEGER NOT NULL, position INTEGER NOT NULL,
   answer INTEGER NOT NULL, seconds REAL, at REAL NOT NULL, withdrawn INTEGER NOT NULL DEFAULT 0);
@@ -112,6 +112,22 @@ class LabelStore:
         self.pairs = list(pairs)
         self.raters_per_pair, self.answers, self.attention = raters_per_pair, answers, attention
         self.clock = clock
+        # How often each pair was answered, and which questions are open, by rater and position: of
+        # a file that this process alone writes to.
+        self._answered = Counter(
+            pair
+            for (pair,) in self.database.all(
+                "SELECT pair FROM answer JOIN question USING (rater, position) WHERE withdrawn = 0"
+            )
+        )
+        self._open = {
+            (rater, position): (pair, asked)
+            for rater, position, pair, asked in self.database.all(
+                "SELECT rater, position, pair, asked FROM question q WHERE NOT EXISTS "
+                "(SELECT 1 FROM answer a WHERE a.rater = q.rater AND a.position = q.position AND "
+                "withdrawn = 0)"
+            )
+        }
 
     def begin(self, name: str) -> Rater:
         """A new rater."""
@@ -151,13 +167,7 @@ class LabelStore:
         Questions are answered in order, so that there is one that is open at most.
         """
         with self.database.writing():
-            found = self.database.one(
-                "SELECT position, first, second, expected FROM question q WHERE rater = ? AND "
-                "NOT EXISTS (SELECT 1 FROM answer a WHERE a.rater = q.rater AND "
-                "a.position = q.position AND withdrawn = 0) ORDER BY position LIMIT 1",
-                [rater.id],
-            )
-            return self._ask(rater) if found is None else LabelQuestion(*found)
+            return self._find_open(rater) or self._ask(rater)
 
     def answer(
         self, rater: Rater, position: int, answer: int, seconds: float | None = None
@@ -180,8 +190,9 @@ class LabelStore:
         if answer not in tuple(Answer):
             raise ValueError(f"answer must be one of {[*map(int, Answer)]}, got {answer}")
         with self.database.writing():
-            asked = "SELECT 1 FROM question WHERE rater = ? AND position = ?"
-            if self.database.one(asked, [rater.id, position]) is None:
+            query = "SELECT pair FROM question WHERE rater = ? AND position = ?"
+            asked = self.database.one(query, [rater.id, position])
+            if asked is None:
                 raise KeyError(f"rater {rater.id} has no question {position}")
             known = "SELECT 1 FROM answer WHERE rater = ? AND position = ? AND withdrawn = 0"
             if self.database.one(known, [rater.id, position]) is not None:
@@ -190,6 +201,9 @@ class LabelStore:
                 "INSERT INTO answer (rater, position, answer, seconds, at) VALUES (?, ?, ?, ?, ?)",
                 [rater.id, position, answer, seconds, self.clock()],
             )
+        with self.database.lock:
+            self._answered[asked[0]] += 1
+            self._open.pop((rater.id, position), None)
         return True
 
     def undo(self, rater: Rater) -> bool:
@@ -199,14 +213,19 @@ class LabelStore:
         """
         with self.database.writing():
             last = self.database.one(
-                "SELECT MAX(position) FROM answer WHERE rater = ? AND withdrawn = 0", [rater.id]
+                "SELECT position, pair FROM answer JOIN question USING (rater, position) WHERE "
+                "rater = ? AND withdrawn = 0 ORDER BY position DESC LIMIT 1",
+                [rater.id],
             )
-            if last is None or last[0] is None:
+            if last is None:
                 return False
             self.database.run(
                 "UPDATE answer SET withdrawn = 1 WHERE rater = ? AND position = ?",
                 [rater.id, last[0]],
             )
+        with self.database.lock:
+            self._answered[last[1]] -= 1
+            self._open[rater.id, last[0]] = last[1], self.clock()
         return True
 
     def given(self) -> list[Given]:
@@ -225,38 +244,42 @@ class LabelStore:
         )
         return {int(rater): (int(passed), int(total)) for rater, passed, total in rows}
 
+    def _find_open(self, rater: Rater) -> LabelQuestion | None:
+        """The first question of a rater that has no answer."""
+        found = self.database.one(
+            "SELECT position, first, second, expected FROM question q WHERE rater = ? AND "
+            "NOT EXISTS (SELECT 1 FROM answer a WHERE a.rater = q.rater AND "
+            "a.position = q.position AND withdrawn = 0) ORDER BY position LIMIT 1",
+            [rater.id],
+        )
+        return None if found is None else LabelQuestion(*found)
+
     def _ask(self, rater: Rater) -> LabelQuestion | None:
         """The next question of a rater, chosen and kept."""
         database, now = self.database, self.clock()
-        own = database.all(
-            "SELECT pair FROM question WHERE rater = ? ORDER BY position", [rater.id]
-        )
+        own = [
+            pair
+            for (pair,) in database.all(
+                "SELECT pair FROM question WHERE rater = ? ORDER BY position", [rater.id]
+            )
+        ]
         position = len(own) + 1
-        seen = {pair for (pair,) in own} - {ATTENTION}
+        seen = set(own) - {ATTENTION}
         if len(seen) >= self.answers:
             return None
-        since = 0  # pairs since the last check
-        for (pair,) in reversed(own):
-            if pair == ATTENTION:
-                break
-            since += 1
         draw = random.Random(f"{rater.token}/{position}")
-        if self.attention and since >= self.attention:
+        if self.attention and ATTENTION not in own[-self.attention :] and position > self.attention:
             first, second = self.pairs[draw.randrange(len(self.pairs))]
             pair, expected = ATTENTION, draw.randrange(2)
         else:
-            counts = dict.fromkeys(range(len(self.pairs)), 0)
-            for index, number in database.all(
-                "SELECT pair, COUNT(*) FROM question q WHERE pair >= 0 AND (asked > ? OR EXISTS "
-                "(SELECT 1 FROM answer a WHERE a.rater = q.rater AND a.position = q.position AND "
-                "withdrawn = 0)) GROUP BY pair",
-                [now - _ABANDONED],
-            ):
-                counts[index] = number
+            waiting = Counter(
+                pair for pair, asked in self._open.values() if asked > now - _ABANDONED
+            )
             free = [
                 (number, draw.random(), pair)
-                for pair, number in counts.items()
-                if pair not in seen and number < self.raters_per_pair
+                for pair in range(len(self.pairs))
+                if pair not in seen
+                and (number := self._answered[pair] + waiting[pair]) < self.raters_per_pair
             ]
             if not free:
                 return None
@@ -268,4 +291,5 @@ class LabelStore:
             "INSERT INTO question VALUES (?, ?, ?, ?, ?, ?, ?)",
             [rater.id, position, pair, first, second, expected, now],
         )
+        self._open[rater.id, position] = pair, now
         return LabelQuestion(position, first, second, expected)

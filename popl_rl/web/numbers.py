@@ -1,14 +1,14 @@
 """What each policy does, in a few numbers that can be told without knowing any group."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import gymnasium
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
-from popl_rl.config import EnvConfig
-from popl_rl.data.environments import World
 from popl_rl.data.rollouts import MASK
 from popl_rl.evaluation.measures import (
     info_rates,
@@ -43,10 +43,13 @@ class Number:
 def policy_numbers(
     policies: PolicySet,
     everybody: PolicySet,
-    world: World,
-    env: EnvConfig,
+    make_env: Callable[[], gymnasium.Env[Any, Any]],
     *,
+    success: str,
+    door: str | None = None,
+    measured: Sequence[str] = (),
     episodes: int,
+    max_steps: int,
     seed: int,
 ) -> list[Number]:
     """Roll every policy and measure what its environment says can be measured.
@@ -54,13 +57,22 @@ def policy_numbers(
     Args:
         policies: N policies.
         everybody: A single one, the one for everybody.
-        world: Where they act.
-        env: What is success, a door, or worth measuring.
+        make_env: Builds an environment to act in.
+        success: Number in ``info`` that is positive when the task is done.
+        door: Integer in ``info`` whose values are worth a rate; None for none.
+        measured: Numbers in ``info`` whose mean and peak are shown.
         episodes: Of each policy.
+        max_steps: Steps after which an episode is cut.
         seed: Of starts and actions.
     """
     own, other = (
-        _measures(some, world, env, episodes=episodes, seed=seed) for some in (policies, everybody)
+        _measures(
+            roll_out(make_env, some, episodes=episodes, max_steps=max_steps, seed=seed),
+            success=success,
+            door=door,
+            measured=measured,
+        )
+        for some in (policies, everybody)
     )
     nothing = torch.zeros(1)  # a door that nobody uses has no rate
     return [
@@ -70,20 +82,19 @@ def policy_numbers(
 
 
 def _measures(
-    policies: PolicySet, world: World, env: EnvConfig, *, episodes: int, seed: int
+    rolled: TensorDictBase, *, success: str, door: str | None, measured: Sequence[str]
 ) -> dict[tuple[str, tuple[tuple[str, Any], ...]], Tensor]:
-    """Values ``[N]`` by phrase and what it is filled with."""
-    rolled = roll_out(world.make, policies, episodes=episodes, max_steps=env.max_steps, seed=seed)
+    """Values ``[N]`` of episodes ``[N, E, H]`` by phrase and what it is filled with."""
     found: dict[tuple[str, tuple[tuple[str, Any], ...]], Tensor] = {}
-    success = success_rate(rolled, env.success)
-    if bool(success.isfinite().all()):
-        found["m_success", ()] = success
-        found["m_steps", ()] = steps_to_success(rolled, env.success)
-    if env.door is not None:
-        for value, rate in info_rates(rolled, env.door).items():
+    done = success_rate(rolled, success)
+    if bool(done.isfinite().all()):
+        found["m_success", ()] = done
+        found["m_steps", ()] = steps_to_success(rolled, success)
+    if door is not None:
+        for value, rate in info_rates(rolled, door).items():
             if value >= 0:
-                found["m_rate", (("name", env.door), ("value", value))] = rate
-    for name in env.measured:
+                found["m_rate", (("name", door), ("value", value))] = rate
+    for name in measured:
         mean, peak = mean_and_peak(rolled, name)
         found["m_mean", (("name", name),)] = mean
         found["m_peak", (("name", name),)] = peak

@@ -16,8 +16,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from popl_rl.config import EnvConfig
-from popl_rl.data.environments import build_world, counting_from_zero
+from popl_rl.data.environments import World, counting_from_zero
 from popl_rl.keys import ACTION, OBSERVATION
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.sets import load_set
@@ -36,16 +35,18 @@ class Scenes:
     """What is to be rendered, as a process can be told it.
 
     Attributes:
-        env: The environment.
+        make_world: Makes the world; something that pickles.
         source: Folder of the segments, or of the policies.
         folder: Where clips are kept.
         seed: Of the starts of episodes; of the run whose segments these are.
+        max_steps: Steps after which an episode of a policy is cut.
     """
 
-    env: EnvConfig
+    make_world: Callable[[], World]
     source: Path
     folder: Path
     seed: int = 0
+    max_steps: int = 1000
 
 
 def segment_clips(
@@ -54,7 +55,7 @@ def segment_clips(
     """Clips of some segments; those that were rendered before are read.
 
     Args:
-        scenes: Environment, ``source/segments`` and, for texts, ``source/texts.json``.
+        scenes: World, ``source/segments`` and, for texts, ``source/texts.json``.
         wanted: Rows of the segments.
         progress: Called with the number of clips that there are.
 
@@ -74,7 +75,7 @@ def policy_clips(
     """Clips of an episode of each policy, all from one start, padded to one length.
 
     Args:
-        scenes: Environment, and the folder of a policy set as ``source``.
+        scenes: World, and the folder of a policy set as ``source``.
         members: Whose episodes.
         progress: Called with the number of clips that there are.
 
@@ -108,7 +109,7 @@ def _rendered(
         missing = list(wanted)  # they are padded to one length
     if missing:
         blocks = [missing]
-        if render is _render_segments and not _records(scenes.env):
+        if render is _render_segments and not _records(scenes):
             blocks = [missing[at : at + _BLOCK] for at in range(0, len(missing), _BLOCK)]
         done = len(clips) - len(missing)
         context = multiprocessing.get_context("spawn")
@@ -124,9 +125,9 @@ def _rendered(
     return found
 
 
-def _records(env: EnvConfig) -> bool:
+def _records(scenes: Scenes) -> bool:
     """Whether segments are shown by collecting them again, all at once."""
-    world = build_world(env)
+    world = scenes.make_world()
     inner = world.env.unwrapped
     world.env.close()
     return hasattr(inner, "record_segments")
@@ -137,7 +138,7 @@ def _render_segments(scenes: Scenes, wanted: list[int]) -> None:
     torch.set_num_threads(1)
     segments = load_tensordict(scenes.source / "segments")
     segments.auto_batch_size_(2)
-    env: Any = build_world(scenes.env).make_for_data().unwrapped
+    env: Any = scenes.make_world().make_for_data().unwrapped
     rate = float(env.metadata.get("render_fps", _RATE))
     if hasattr(env, "record_segments"):
 
@@ -172,7 +173,7 @@ def _render_policies(scenes: Scenes, members: list[int]) -> None:
     torch.set_num_threads(1)
     policies = load_set(scenes.source)
     assert isinstance(policies, PolicySet)
-    env: Any = counting_from_zero(build_world(scenes.env).make())
+    env: Any = counting_from_zero(scenes.make_world().make())
     env.unwrapped.render_mode = "rgb_array"
     rate = float(env.metadata.get("render_fps", _RATE))
     films = {}
@@ -180,7 +181,7 @@ def _render_policies(scenes: Scenes, members: list[int]) -> None:
         generator = torch.Generator().manual_seed(scenes.seed)
         seen, _ = env.reset(seed=scenes.seed)
         frames, over = [env.render()], False
-        while not over and len(frames) <= scenes.env.max_steps:
+        while not over and len(frames) <= scenes.max_steps:
             batch = torch.as_tensor(seen).float().unsqueeze(0)
             action = policies.act(batch, member=member, generator=generator)[0].numpy().copy()
             seen, _, ended, cut, _ = env.step(action)

@@ -1,5 +1,6 @@
 import io
 import json
+from functools import partial
 
 import imageio.v3
 import numpy as np
@@ -12,6 +13,10 @@ from popl_rl.data.environments import build_world
 from popl_rl.storage import save_tensordict
 from popl_rl.web.clips import Clip, film_strip, read_clip, write_clip
 from popl_rl.web.rendering import Scenes, policy_clips, segment_clips
+
+
+def world(**settings):
+    return partial(build_world, EnvConfig(**settings))
 
 
 def grey(value, height=20, width=30):
@@ -52,8 +57,7 @@ def test_clips_are_kept(tmp_path):
 
 
 def test_a_segment_of_two_doors_is_drawn_as_it_happened():
-    world = build_world(EnvConfig(options={"size": 7}))
-    env = world.make_for_data().unwrapped
+    env = world(options={"size": 7})().make_for_data().unwrapped
     generator = torch.Generator().manual_seed(0)
     env.reset(seed=1)
     infos, frames = [], [env.get_frame(highlight=False, tile_size=24)]
@@ -68,7 +72,7 @@ def test_a_segment_of_two_doors_is_drawn_as_it_happened():
 
 def test_texts_beside_the_segments_come_first(tmp_path):
     (tmp_path / "texts.json").write_text(json.dumps(["zero", "one", "two"]))
-    scenes = Scenes(EnvConfig(), tmp_path, tmp_path / "clips")
+    scenes = Scenes(world(), tmp_path, tmp_path / "clips")
     assert segment_clips(scenes, [2, 0]) == {2: Clip(text="two"), 0: Clip(text="zero")}
     with pytest.raises(ValueError, match=r"one for each segment, got 3; segment 3 is asked for"):
         segment_clips(scenes, [3])
@@ -88,7 +92,7 @@ def test_items_are_told_in_words_by_a_process_of_its_own_and_once(tmp_path):
         [2, 1],
     )
     save_tensordict(segments, tmp_path / "segments")
-    scenes = Scenes(EnvConfig(factory="hidden_utility"), tmp_path, tmp_path / "clips")
+    scenes = Scenes(world(factory="hidden_utility"), tmp_path, tmp_path / "clips")
     told = []
     assert segment_clips(scenes, [1], progress=told.append) == {1: Clip(text="0.50")}
     assert told == [1]
@@ -102,7 +106,7 @@ def test_policies_are_drawn_from_one_start_in_one_length(tmp_path, config_of, ti
     from popl_rl.trainers import train_popl
 
     train_popl.run(config_of(*tiny, f"run_dir={tmp_path / 'run'}"))
-    env = EnvConfig(options={"size": 7}, max_steps=20)
-    scenes = Scenes(env, tmp_path / "run" / "policies", tmp_path / "clips")
+    small = world(options={"size": 7})
+    scenes = Scenes(small, tmp_path / "run" / "policies", tmp_path / "clips", max_steps=20)
     clips = policy_clips(scenes, [0])
     assert clips[0].frames > 1

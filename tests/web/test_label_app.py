@@ -120,7 +120,8 @@ def test_strangers_are_sent_to_the_first_page(visitor):
     for path in ("/label", "/pause", "/done"):
         assert browser.get(path).url.path == "/"
     for path in ("/answer", "/undo"):
-        assert browser.post(path, data={}).status_code == 409
+        said = {"position": 1, "answer": "first"}
+        assert browser.post(path, data=said).status_code == 409
     assert visitor().post("/start", headers={"origin": "http://evil"}).status_code == 403
 
 
