@@ -32,7 +32,7 @@ SPEEDS = (0.25, 0.4, 0.6, 0.8)
 
 @dataclass(frozen=True)
 class TaskState:
-    """What :meth:`MetaworldTask.set_state` goes on from; valid in the process that made it.
+    """What ``MetaworldTask.set_state`` goes on from; valid in the process that made it.
 
     Attributes:
         simulator: The simulator's own state.
@@ -41,7 +41,7 @@ class TaskState:
         hand: Position of the hand, m.
         velocity: Its velocity during the last step, m/s.
         thing: Position of the (first) object, m.
-        remaining: See :class:`MetaworldTask`.
+        remaining: See ``MetaworldTask``.
         observation: The last observation.
         info: The last info.
     """
@@ -195,7 +195,7 @@ class MetaworldTask(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Return what data can show: Metaworld's scripted policy, slow to quick, clean to rough.
 
         Returns:
-            By name ``scripted/<m/s>`` and ``rough/<m/s>``; see :class:`Scripted`.
+            By name ``scripted/<m/s>`` and ``rough/<m/s>``; see ``Scripted``.
         """
         clean = {f"scripted/{v}": Scripted(self.task, speed=v, noise=0.1) for v in self.speeds}
         rough = {
@@ -214,7 +214,7 @@ class MetaworldTask(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Collect segments: from each of many states, one at each of the scripted speeds.
 
         What can be done from one state, slowly or fast, is what people can compare. See
-        :func:`popl_rl.envs._metaworld_data.collect_continuations`.
+        ``popl_rl.envs._metaworld_data.collect_continuations``.
 
         Args:
             num_segments: Segments to collect, a multiple of the number of speeds.

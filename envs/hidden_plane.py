@@ -18,7 +18,7 @@ __all__ = ["hidden_plane", "plane"]
 def hidden_plane(
     *, max_steps: int = 1000, render_mode: str | None = None
 ) -> gymnasium.Env[Any, Any]:
-    """Make a :class:`~popl_rl.envs.hidden_utility.HiddenUtility` of states (x, y)."""
+    """Make a ``popl_rl.envs.hidden_utility.HiddenUtility`` of states (x, y)."""
     made: gymnasium.Env[Any, Any]
     made = HiddenUtility(dimensions=2, max_steps=max_steps, render_mode=render_mode)
     return made

@@ -43,7 +43,7 @@ class HiddenUtility(gymnasium.Env[Any, Any]):
     Each ``info`` holds ``coin``, a number drawn uniformly from [0, 1) with each state and not part
     of the observation: that of the state in which the step was taken (at reset: of the first
     state), so that it lies beside this state in a segment. It is a hidden context that belongs to
-    no person; only the raters :func:`coin` and ``plane`` look at it.
+    no person; only the raters ``coin`` and ``plane`` look at it.
 
     Args:
         dimensions: Coordinates of a state.
@@ -102,7 +102,7 @@ class HiddenUtility(gymnasium.Env[Any, Any]):
 def hidden_utility(
     *, dimensions: int = 1, max_steps: int = 1000, render_mode: str | None = None
 ) -> gymnasium.Env[Any, Any]:
-    """Make a :class:`HiddenUtility`, whose arguments these are."""
+    """Make a ``HiddenUtility``, whose arguments these are."""
     return HiddenUtility(dimensions=dimensions, max_steps=max_steps, render_mode=render_mode)
 
 
@@ -111,8 +111,8 @@ def sample_states(
 ) -> TensorDict:
     """Draw segments without stepping through an environment.
 
-    They are distributed as those that :func:`~popl_rl.data.segments.collect_segments` cuts from
-    episodes of :class:`HiddenUtility`, and have the same keys.
+    They are distributed as those that ``popl_rl.data.segments.collect_segments`` cuts from episodes
+    of ``HiddenUtility``, and have the same keys.
 
     Args:
         count: Segments N.

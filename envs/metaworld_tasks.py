@@ -36,7 +36,7 @@ def metaworld(
     size: int = 240,
     camera: str = "corner2",
 ) -> gymnasium.Env[Any, Any]:
-    """Make a :class:`MetaworldTask`, whose arguments these are."""
+    """Make a ``MetaworldTask``, whose arguments these are."""
     made: gymnasium.Env[Any, Any] = MetaworldTask(
         task,
         max_steps=max_steps,

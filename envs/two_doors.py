@@ -311,7 +311,7 @@ def two_doors(
     max_steps: int = 60,
     render_mode: str | None = None,
 ) -> gymnasium.Env[Any, Any]:
-    """Make a :class:`TwoDoors`, whose arguments these are."""
+    """Make a ``TwoDoors``, whose arguments these are."""
     return TwoDoors(
         size=size, doors=doors, start=start, max_steps=max_steps, render_mode=render_mode
     )

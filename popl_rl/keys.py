@@ -8,14 +8,14 @@ Segments, batch size ``[N]`` (N segments of T steps):
 | ``action`` | ``[N, T]`` or ``[N, T, A]`` | int64 or float32 | what was done |
 | ``reward`` | ``[N, T]`` | float32 | the environment's own reward, for raters that use it |
 | ``("info", name)`` | ``[N, T]`` | float32 or int64 | each number of the ``info`` |
-| ``("info", "start")`` | ``[N, T]`` | int64 | which segments may be compared, see :data:`START` |
+| ``("info", "start")`` | ``[N, T]`` | int64 | which segments may be compared, see ``START`` |
 
 Preferences, batch size ``[M]``:
 
 | key | shape | dtype | what |
 |---|---|---|---|
 | ``pair`` | ``[M, 2]`` | int64 | rows of the two segments that were compared |
-| ``answer`` | ``[M]`` | int64 | an :class:`Answer` |
+| ``answer`` | ``[M]`` | int64 | an ``Answer`` |
 | ``rater`` | ``[M]`` | int64 | id of the person who answered |
 | ``("hidden", "group")`` | ``[M]`` | int64 | group of that person. For evaluation only |
 | ``("hidden", "utility")`` | ``[M, 2]`` | float32 | utility of each segment. For evaluation only |

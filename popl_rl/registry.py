@@ -1,10 +1,10 @@
 """A reference becomes an object: a name, ``package.module:attr``, or ``path/file.py:attr``.
 
-Nothing is known here by name. Objects are found because they were decorated (:func:`env`,
-:func:`rater`, :func:`behaviour`) or because an installed package declares them as entry points in
-the group of its kind: ``popl_rl.env``, ``popl_rl.rater``, ``popl_rl.behaviour``,
-``popl_rl.selection``, ``popl_rl.method`` or ``popl_rl.reader``. References, not objects, are
-what configurations and worker processes carry.
+Nothing is known here by name. Objects are found because they were decorated (``env``, ``rater``,
+``behaviour``) or because an installed package declares them as entry points in the group of its
+kind: ``popl_rl.env``, ``popl_rl.rater``, ``popl_rl.behaviour``, ``popl_rl.selection``,
+``popl_rl.method`` or ``popl_rl.reader``. References, not objects, are what configurations and
+worker processes carry.
 """
 
 import difflib
@@ -102,7 +102,7 @@ def selection(name: str) -> Callable[[_T], _T]:
 def method(name: str) -> Callable[[_T], _T]:
     """Register a method: a class that is built from a ``Problem`` and has steps and a result.
 
-    See :class:`popl_rl.algorithms.problem.Method`.
+    See ``popl_rl.algorithms.problem.Method``.
 
     Args:
         name: What configurations call it.

@@ -10,10 +10,11 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-from tensordict import TensorDict, TensorDictBase
+if TYPE_CHECKING:
+    # Imported where they are used: what writes JSON alone need not wait for PyTorch.
+    from tensordict import TensorDict, TensorDictBase
 
 __all__ = [
     "explaining_full_disk",
@@ -63,7 +64,7 @@ def written_beside(path: Path) -> Iterator[Path]:
         shutil.rmtree(outer, ignore_errors=True)
 
 
-def save_tensordict(data: TensorDictBase, path: Path) -> None:
+def save_tensordict(data: "TensorDictBase", path: Path) -> None:
     """Write a TensorDict of any shape as memory maps and JSON; nothing is left half-written.
 
     Args:
@@ -77,8 +78,8 @@ def save_tensordict(data: TensorDictBase, path: Path) -> None:
         data.detach().cpu().clone().memmap(beside, copy_existing=True)
 
 
-def load_tensordict(path: Path, *, required: Mapping[str, int] | None = None) -> TensorDict:
-    """Read what :func:`save_tensordict` wrote, into memory.
+def load_tensordict(path: Path, *, required: Mapping[str, int] | None = None) -> "TensorDict":
+    """Read what ``save_tensordict`` wrote, into memory.
 
     Args:
         path: Folder to read.
@@ -88,6 +89,8 @@ def load_tensordict(path: Path, *, required: Mapping[str, int] | None = None) ->
         FileNotFoundError: If there is no such folder.
         ValueError: If the folder is truncated, damaged, or holds something else.
     """
+    from tensordict import TensorDict
+
     path = Path(path)
     if not path.is_dir():
         raise FileNotFoundError(f"no saved data at {path}: expected the folder of an earlier run")
@@ -113,6 +116,8 @@ def _check_whole(path: Path) -> None:
 
     Loading would fill what is missing with zeros, and lengthen the file.
     """
+    import torch
+
     for about in path.rglob("meta.json"):
         entries = json.loads(about.read_text()).values()
         declared = sum(
@@ -185,5 +190,5 @@ def write_atomic(path: Path, content: str | bytes) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file with :func:`write_atomic`."""
+    """Write a JSON file with ``write_atomic``."""
     write_atomic(path, json.dumps(value, indent=2) + "\n")

@@ -11,6 +11,7 @@ from popl_rl.config import (
     MethodConfig,
     RatersConfig,
     parse_epsilon,
+    plain,
     unread,
     validate,
 )
@@ -205,6 +206,17 @@ def test_settings_that_the_method_does_not_read_are_refused_with_who_does():
     )
     (problem,) = unread(["+method.vpl.kl=1"], method, READERS)
     assert problem.endswith("it is read by no known method")
+
+
+def test_a_foreign_method_reads_the_recipe_unless_it_says_more(config_of):
+    own = ["method.factory=mine.py:Mine", "method.name=mine"]
+    method = plain(config_of(*own)).method
+    assert method.sections() == ["training"]
+    [problem] = unread(["method.popl.tournament=3"], method, {"popl": ["training", "popl"]})
+    assert "not read by method 'mine', which reads training; it is read by popl" in problem
+    more = plain(config_of(*own, "method.reads=[training,vpl]")).method
+    assert more.sections() == ["training", "vpl"]
+    assert plain(config_of()).method.sections() == ["training", "popl", "refinement", "mixture"]
 
 
 def test_settings_of_a_clone_are_for_style_codes():

@@ -1,12 +1,37 @@
-"""Every registered environment and rater keeps what check_env and check_rater ask for."""
+"""Everything that is shipped keeps what the checks of plug-ins ask for."""
+
+from importlib.resources import files
 
 import pytest
+import torch
 
 from popl_rl import registry
-from popl_rl.testing import check_env, check_rater
+from popl_rl.config import plain
+from popl_rl.experiments.builders import build_method, build_problem
+from popl_rl.models.policies import PolicySpec
+from popl_rl.selection.rules import SELECTIONS
+from popl_rl.testing import check_env, check_method, check_rater, check_selection
 
 ENVS = registry.names("env")
 RATERS = registry.names("rater")
+METHODS = sorted(
+    path.name.removesuffix(".yaml")
+    for path in files("popl_rl.configs.method").iterdir()
+    if path.name.endswith(".yaml")
+)
+#: Small, whatever the method.
+QUICK = [
+    "method.members=4",
+    "method.generations=3",
+    "method.hidden=[6]",
+    "method.training.steps=6",
+    "method.training.batch_size=16",
+    "method.popl.specialist_steps=3",
+    "method.popl.pooled_steps=4",
+    "method.popl.warm_up=3",
+    "method.refinement.steps=20",
+    "method.em.groups=2",
+]
 
 
 def home(rater):
@@ -31,3 +56,37 @@ def test_raters(name):
     environment = home(name)
     assert environment is not None, f"no environment is defined beside rater {name!r}"
     check_rater(name, environment)
+
+
+@pytest.mark.parametrize("name", ["lexicase", *SELECTIONS])
+def test_selections(name):
+    check_selection(name)
+
+
+@pytest.fixture(scope="session")
+def method_settings(config_of):
+    """Settings of a method by its name in ``configs/method``, and small."""
+    return lambda name: plain(config_of(f"method={name}", *QUICK)).method
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_methods(name, method_settings):
+    """Among it that one seed gives one result to the bit, and that resuming changes no bit."""
+    method = method_settings(name)
+    sections = {part: getattr(method, part) for part in method.sections() if part != "training"}
+    kinds = {"cases": method.cases, "evolve": method.evolve}
+    check_method(method.factory, **kinds, sections=sections, **method.options)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_methods_of_other_seeds_find_something_else(name, method_settings, bank, comparisons):
+    method = method_settings(name)
+    problem = build_problem(method, PolicySpec(5, 2, True, (6,)), bank, comparisons)
+
+    def learn(seed):
+        generator = torch.Generator().manual_seed(seed)
+        built = build_method(method, problem, num_groups=2, generator=generator)
+        built.step()
+        return list(built.population.members.data.values(True, True))
+
+    assert not any(map(torch.equal, learn(0), learn(1)))

@@ -8,11 +8,13 @@ from dataclasses import fields, is_dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from popl_rl.config import Config
 from popl_rl.experiments.tables import fill_tables, make_tables, read_tables
 from popl_rl.testing import check_env, check_rater
+from popl_rl.testing.command import main as check
 from popl_rl.trainers import train_popl
 
 ROOT = Path(__file__).parents[1]
@@ -165,7 +167,7 @@ def test_the_data_shown_can_be_learnt_from(config_of, tiny, tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path)
     exec(block_with("popl_rl/README.md", "my_data"), {})
     [command] = [command for command in COMMANDS if "data.load=my_data" in command]
-    loaded = shlex.split(command)[1:]
+    loaded = [*shlex.split(command)[1:], "evaluation.pairs=12"]  # all that there are
     result = train_popl.run(config_of(*tiny[1:], *loaded, "run_dir=run"))
     assert len(result.policies) >= 1
 
@@ -182,6 +184,31 @@ def test_plug_ins_of_the_method_can_be_used(what, file, config_of, tiny, tmp_pat
     read = [o for o in tiny if what != "class NoisyLexicase" or not o.startswith(NOT_TRAINING)]
     result = train_popl.run(config_of(*read, *overrides, "run_dir=run"))
     assert len(result.policies) >= 1
+    [checked] = [command for command in LAUNCHED if file in command]
+    assert check(shlex.split(checked)[3:]) == 0
+
+
+def test_the_reader_shown_can_be_used(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("my_reader.py").write_text(block_with("popl_rl/README.md", "def read"))
+    rows = {"observation": (6, 12, 18), "goal": (6, 12)}
+    columns = {name: np.zeros(shape, dtype=np.float32) for name, shape in rows.items()}
+    columns |= {"action": np.ones((6, 12), int), "pair": np.arange(6).reshape(3, 2)}
+    np.savez("answers.npz", **columns, answer=np.array([0, 1, 3]), rater=np.array([0, 0, 7]))
+    [checked] = [command for command in LAUNCHED if "my_reader.py" in command]
+    assert check(shlex.split(checked)[3:]) == 0
+
+
+def test_docstrings_name_things_as_the_reference_links_them():
+    """In backticks, with dots where they are elsewhere: pdoc shows Sphinx's roles as they stand."""
+    folders = ("popl_rl", "envs", "trainers", "configs", "tests")
+    paths = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
+    found = {
+        str(path.relative_to(ROOT)): re.findall(r":[a-z]+:`[^`]+`", path.read_text("utf-8"))
+        for path in paths
+        if path.name not in ("refinement.py", "mixture_population.py")
+    }
+    assert {path: roles for path, roles in found.items() if roles} == {}
 
 
 @pytest.mark.docs
@@ -203,6 +230,8 @@ def test_the_reference_builds_without_warnings(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "warn" not in done.stderr.lower(), done.stderr
     assert (tmp_path / "popl_rl" / "selection" / "lexicase.html").is_file()
+    shown = (tmp_path / "popl_rl" / "algorithms" / "trainer.html").read_text("utf-8")
+    assert 'href="popl.html#POPL.step"' in shown.replace("../algorithms/", "")
     # A package that is new must be named in the command too.
     packages = {path.parent.name for path in (ROOT / "popl_rl").glob("*/__init__.py")}
     assert packages <= {path.stem for path in (tmp_path / "popl_rl").glob("*.html")}

@@ -57,6 +57,7 @@ def test_fast_and_gentle_find_their_policies_in_metaworld(config_of, tmp_path):
     config = config_of(
         "env=metaworld/button_press",
         "data.segments=400",
+        "evaluation.pairs=120",  # six of each of the twenty states that are kept
         f"data.store={tmp_path / 'store'}",
         "method.clone.steps=1000",
         "method.members=12",

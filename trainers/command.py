@@ -16,11 +16,13 @@ from popl_rl.config import (
     Config,
     EvaluateConfig,
     LabelConfig,
+    MethodConfig,
     ServeConfig,
     plain,
     unread,
     validate,
 )
+from popl_rl.trainers.spelling import explained
 
 __all__ = ["USER_ERRORS", "prepare", "register_schemas", "run_command"]
 
@@ -29,7 +31,7 @@ USER_ERRORS = (HydraException, OmegaConfBaseException, ValueError, TypeError, OS
 
 
 def register_schemas() -> None:
-    """Make the dataclasses of :mod:`popl_rl.config` known to Hydra."""
+    """Make the dataclasses of ``popl_rl.config`` known to Hydra."""
     store = ConfigStore.instance()
     store.store(name="schema", node=Config)
     store.store(name="evaluate_schema", node=EvaluateConfig)
@@ -37,11 +39,15 @@ def register_schemas() -> None:
     store.store(name="serve_schema", node=ServeConfig)
 
 
-def run_command(main: Callable[[], Any]) -> None:
+def run_command(main: Callable[[], Any], schema: type = Config) -> None:
     """Run a Hydra main function and leave with the right exit code.
 
     0 when it worked, 2 when the user can put it right (bad option, file or value), 130 after
     Ctrl-C, 1 for a defect of ours. ``HYDRA_FULL_ERROR=1`` shows the traceback of user errors too.
+
+    Args:
+        main: The function.
+        schema: Dataclass of its settings, which what is misspelt is compared with.
     """
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     if os.environ.get("HYDRA_FULL_ERROR") == "1":
@@ -55,7 +61,7 @@ def run_command(main: Callable[[], Any]) -> None:
         _print_error("\ninterrupted; continue with resume=<folder of the run>")
         sys.exit(130)
     except USER_ERRORS as error:
-        _print_error(f"error: {error}")
+        _print_error(f"error: {explained(error, schema)}")
         sys.exit(2)
     finally:
         del os.environ["HYDRA_FULL_ERROR"]
@@ -95,7 +101,8 @@ def _readers() -> dict[str, list[str]]:
     for entry in files("popl_rl.configs.method").iterdir():
         if entry.name.endswith(".yaml"):
             content: Any = OmegaConf.create(entry.read_text(encoding="utf-8"))
-            found[entry.name.removesuffix(".yaml")] = list(content.get("reads", []))
+            given = {name: content[name] for name in ("factory", "reads") if name in content}
+            found[entry.name.removesuffix(".yaml")] = MethodConfig(**given).sections()
     return dict(sorted(found.items()))
 
 

@@ -11,74 +11,27 @@ popl-evaluate run_dir=runs/<name> seed=1 evaluation.episodes=1000
 """
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import hydra
-import torch
 from omegaconf import OmegaConf
-from rich.console import Console
 
-from popl_rl.config import Config, EvaluateConfig, validate
-from popl_rl.data.environments import build_world
-from popl_rl.evaluation.diagnostics import alarm, diagnostics
-from popl_rl.evaluation.results import Scoreboard
-from popl_rl.experiments.builders import build_spec
-from popl_rl.experiments.data import build_groups, make_data
-from popl_rl.experiments.evaluators import make_evaluator
-from popl_rl.experiments.report import markdown, results_table
-from popl_rl.experiments.run_folder import load_config, save_config
-from popl_rl.models.policy_set import PolicySet
-from popl_rl.models.reward_set import RewardSet
-from popl_rl.models.sets import load_set
-from popl_rl.storage import write_atomic, written_beside
+from popl_rl.config import Config, EvaluateConfig, load_config, validate
 from popl_rl.trainers.command import register_schemas, run_command
 
+if TYPE_CHECKING:
+    from popl_rl.evaluation.results import Scoreboard
 
-def run(config: EvaluateConfig) -> tuple[Path, Scoreboard]:
+
+def run(config: EvaluateConfig) -> tuple[Path, "Scoreboard"]:
     """Evaluate again; returns the folder that was written and the scoreboard."""
     run_dir = Path(config.run_dir)
-    kept = run_dir / "data"
-    stored = _settings(config, run_dir, has_data=kept.is_dir())
+    stored = _settings(config, run_dir, has_data=(run_dir / "data").is_dir())
     seed = stored.seed + 1 if config.seed is None else config.seed
-    torch.set_num_threads(stored.threads)
-    is_reward = (run_dir / RewardSet.folder).is_dir()
-    found = load_set(run_dir / (RewardSet if is_reward else PolicySet).folder)
-    base_path = run_dir / "baselines"
-    baselines = None
-    if stored.evaluation.baselines and base_path.is_dir():
-        baselines = load_set(base_path)
-    world = build_world(stored.env)
-    groups = build_groups(stored.raters, world)
-    given = None if stored.data.load is None else Path(stored.data.load)
-    data = make_data(
-        stored.data,
-        stored.raters,
-        world,
-        groups,
-        seed=stored.seed,
-        env=stored.env,
-        load=kept if kept.is_dir() else given,
-    )
-    spec = build_spec(stored.method, world.env)
-    path = run_dir / "clone"
-    clone = load_set(path) if path.is_dir() else None
-    evaluator = make_evaluator(stored, world, groups, data, spec, clone=clone, seed=seed)
-    board = evaluator.score(found, baselines, label=stored.method.name)
-    number = 1 + len(list((run_dir / "evaluations").glob("[0-9]*")))
-    folder = run_dir / "evaluations" / f"{number:03d}"
-    used = {"run_dir": str(config.run_dir), "evaluation": stored.evaluation, "seed": seed}
-    title = f"Evaluation {number} of {run_dir.name}"
-    about = {
-        "answers of each new rater": stored.evaluation.answers,
-        "seed": seed,
-        **diagnostics(board, evaluator),
-    }
-    report = markdown(board.results, title=title, about=about, figures=[])
-    with written_beside(folder) as beside:
-        save_config(beside, used)
-        write_atomic(beside / "results.csv", board.results.to_csv(index=False))
-        write_atomic(beside / "report.md", report)
-    return folder, board
+    # Imported late, so that a wrong setting is told at once.
+    from popl_rl.experiments.reevaluation import evaluate_again
+
+    return evaluate_again(stored, run_dir, seed=seed)
 
 
 def _settings(config: EvaluateConfig, run_dir: Path, *, has_data: bool) -> Any:
@@ -103,6 +56,11 @@ register_schemas()
 def main(cfg: Any) -> None:
     """Hydra's entry."""
     folder, board = run(cfg)
+    from rich.console import Console
+
+    from popl_rl.evaluation.diagnostics import alarm
+    from popl_rl.experiments.report import results_table
+
     console = Console()
     console.print(results_table(board.results))
     warning = alarm(board.results)
@@ -113,7 +71,7 @@ def main(cfg: Any) -> None:
 
 def cli() -> None:
     """Console command ``popl-evaluate``."""
-    run_command(main)
+    run_command(main, EvaluateConfig)
 
 
 if __name__ == "__main__":

@@ -95,7 +95,7 @@ def prepare(config: LabelConfig) -> Labelling:
 
 def _material(config: LabelConfig, out: Path) -> tuple[list[tuple[int, int]], "Clips"]:
     """Which pairs are compared, and what people see of them."""
-    from popl_rl.data.environments import build_world
+    from popl_rl.experiments.data import build_world
     from popl_rl.experiments.label_data import gather_segments
     from popl_rl.experiments.loggers import Progress
     from popl_rl.models.sets import load_set
@@ -154,7 +154,7 @@ def main(cfg: Any) -> None:
 
 def cli() -> None:
     """Console command ``popl-label``."""
-    run_command(main)
+    run_command(main, LabelConfig)
 
 
 if __name__ == "__main__":

@@ -12,27 +12,22 @@ import time
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import hydra
-import pandas as pd
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 from rich.console import Console
-from rich.table import Column, Table
-from rich.text import Text
 
-from popl_rl.evaluation.method_names import drawn_references
-from popl_rl.evaluation.statistics import HEADLINES, headline_measure
 from popl_rl.evaluation.suite import Suite
-from popl_rl.experiments.benchmark_report import write_report
-from popl_rl.experiments.benchmark_tables import recovery_table
 from popl_rl.experiments.cells import Cell, claim, collect, is_finished, plan
 from popl_rl.experiments.jobs import Job, run_jobs
-from popl_rl.experiments.run_folder import Progress
 from popl_rl.experiments.suites import load_suite
 from popl_rl.trainers.benchmark_cells import make_tasks, run_task
 from popl_rl.trainers.command import register_schemas, run_command
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass
@@ -52,13 +47,17 @@ class Result:
 
     run_dir: Path
     suite: Suite
-    results: pd.DataFrame
+    results: "pd.DataFrame"
     failures: dict[str, str]
 
 
 def run(config: BenchmarkConfig) -> Result:
     """Run the cells that are not finished, and put together what all of them say."""
     # 1. What there is to do.
+    if config.workers < 0:
+        raise ValueError(
+            f"workers must be at least 0, got {config.workers}; 0 works in one process"
+        )
     suite = load_suite(config.suite, folder=files("popl_rl.configs.suites"))
     cells = plan(suite, seeds=suite.seeds if config.seeds is None else config.seeds)
     run_dir = Path(config.run_dir or f"runs/benchmark-{suite.name}")
@@ -66,6 +65,9 @@ def run(config: BenchmarkConfig) -> Result:
     claim(run_dir, suite, cells)
     unfinished = [cell for cell in wanted if not is_finished(cell, run_dir)]
     tasks = make_tasks(unfinished, run_dir)
+    # Imported late, so that a wrong setting is told at once.
+    from popl_rl.experiments.benchmark_report import write_report
+    from popl_rl.experiments.loggers import Progress
 
     # 2. Doing it.
     jobs = [Job(t.cell.name, t, t.cell.source.name if t.cell.source else None) for t in tasks]
@@ -101,6 +103,13 @@ def _one(cells: list[Cell], index: int) -> list[Cell]:
 
 def show(result: Result) -> None:
     """Print the table and where everything is."""
+    from rich.table import Column, Table
+    from rich.text import Text
+
+    from popl_rl.evaluation.method_names import drawn_references
+    from popl_rl.evaluation.statistics import HEADLINES, headline_measure
+    from popl_rl.experiments.benchmark_tables import recovery_table
+
     console = Console()
     suite = result.suite
     (_, *methods), rows = recovery_table(suite, result.results)
@@ -143,7 +152,7 @@ def main(cfg: Any) -> None:
 
 def cli() -> None:
     """Console command ``popl-benchmark``."""
-    run_command(main)
+    run_command(main, BenchmarkConfig)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, cast
 import hydra
 from omegaconf import OmegaConf
 
-from popl_rl.config import Config, ServeConfig, plain, validate
+from popl_rl.config import Config, ServeConfig, load_config, plain, validate
 from popl_rl.trainers.command import register_schemas, run_command
 
 if TYPE_CHECKING:
@@ -65,8 +65,7 @@ def prepare(config: ServeConfig) -> Serving:
     require_extra()
     import torch
 
-    from popl_rl.data.environments import build_world
-    from popl_rl.experiments.run_folder import load_config
+    from popl_rl.experiments.data import build_world
     from popl_rl.web.guards import guards, hosts_of
     from popl_rl.web.pages import Pages
     from popl_rl.web.serve_app import ServePages
@@ -142,7 +141,7 @@ def _shown(
     config: ServeConfig, stored: Config, run_dir: Path, caterer: "Caterer", world: "World"
 ) -> Show:
     """Clips of the segments and of what each member does, or likes best if it cannot act."""
-    from popl_rl.data.environments import build_world
+    from popl_rl.experiments.data import build_world
     from popl_rl.experiments.loggers import Progress
     from popl_rl.models.policy_set import PolicySet
     from popl_rl.web.clips import Clip
@@ -241,7 +240,7 @@ def main(cfg: Any) -> None:
 
 def cli() -> None:
     """Console command ``popl-serve``."""
-    run_command(main)
+    run_command(main, ServeConfig)
 
 
 if __name__ == "__main__":

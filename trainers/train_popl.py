@@ -61,7 +61,7 @@ def run(config: Config) -> Result:
 
         # 4. Evaluated for every hidden group; told in a table, in pictures and in words.
         board = steps.evaluate(config, setting, found, references, run_dir)
-        figures = steps.draw(setting, found, references, board, run_dir)
+        figures = steps.draw(config, setting, found, references, board, run_dir)
         steps.log_results(logger, board, figures, method.generations)
     steps.write_report(config, setting, found, board, figures, run_dir)
     return Result(run_dir, found, board)

@@ -41,8 +41,8 @@ def group_weights(group: Tensor, num_groups: int) -> Tensor:
 class GroupCPL(MultiCPL):
     """CPL hypotheses that draw each comparison as often as they are told to.
 
-    With the weights of :func:`group_weights` these are pooled CPL and the oracle of each group, by
-    the recipe of every other method.
+    With the weights of ``group_weights`` these are pooled CPL and the oracle of each group, by the
+    recipe of every other method.
 
     Args:
         problem: What is to be learnt.

@@ -177,9 +177,9 @@ class DistributionalReward:
 
         Args:
             bank: N segments.
-            risk: Quantile in (0, 1), or None for the mean. In the mean-and-variance model it is
-                mu + Phi^-1(risk) sigma, in the categorical one :func:`interpolated_quantile` of
-                the distribution of the sum.
+            risk: Quantile in (0, 1), or None for the mean. In the mean-and-variance model it is mu
+                + Phi^-1(risk) sigma, in the categorical one ``interpolated_quantile`` of the
+                distribution of the sum.
 
         Returns:
             ``[N]``.
@@ -254,9 +254,9 @@ def train_dpl(
 
     Distributional preference learning (Siththaranjan, Laidlaw and Hadfield-Menell, ICLR 2024, arXiv
     2312.08358) minimises the mean of -log P(preferred > other) over the comparisons, where P is
-    that of :func:`normal_log_preference` or of :func:`categorical_log_preference`. Neither looks at
-    who answered: hidden groups become spread of utility. The model flips its coins for each
-    segment anew; that one rater answers on both sides of a comparison, it cannot say.
+    that of ``normal_log_preference`` or of ``categorical_log_preference``. Neither looks at who
+    answered: hidden groups become spread of utility. The model flips its coins for each segment
+    anew; that one rater answers on both sides of a comparison, it cannot say.
 
     Args:
         bank: Segments. Their observations are looked at, their actions are not.

@@ -82,6 +82,6 @@ class EM(MultiCPL):
         return {**super().state_dict(), "share": self.share.clone()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from :meth:`state_dict`, bit for bit."""
+        """Continue from ``state_dict``, bit for bit."""
         super().load_state_dict(state)
         self.share = state["share"].clone()

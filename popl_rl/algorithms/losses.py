@@ -27,7 +27,7 @@ def cpl_loss(
         other: Scores of the others, same shape.
         conservatism: Lambda in (0, 1].
         slip: Chance that an answer is a slip, in [0, 0.5), see
-            :func:`~popl_rl.models.preference_likelihood.log_likelihood`.
+            ``popl_rl.models.preference_likelihood.log_likelihood``.
 
     Returns:
         Losses, same shape.

@@ -87,7 +87,7 @@ class MultiCPL:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from :meth:`state_dict`, bit for bit."""
+        """Continue from ``state_dict``, bit for bit."""
         self.generation = int(state["generation"])
         self.population.members.data.update_(state["members"])
         self.training.load_state_dict(state["training"])

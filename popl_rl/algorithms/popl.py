@@ -38,9 +38,9 @@ class POPL:
         variation: How children differ from their parents.
         epsilon: Tolerance of lexicase selection; ``"mad"``, a number, or None for none.
         similarity: How alike the raters want, ``[C, C]`` in [-1, 1] (see
-            :mod:`popl_rl.algorithms.rater_similarity`). If given, a child is selected for one
-            rater, whose case comes first in its order, and learns from raters like that one. Half
-            of these raters are random, the others unlike each other, so that small groups are not
+            ``popl_rl.algorithms.rater_similarity``). If given, a child is selected for one rater,
+            whose case comes first in its order, and learns from raters like that one. Half of these
+            raters are random, the others unlike each other, so that small groups are not
             overlooked.
         select: Rule that takes the place of lexicase selection; for whom children are, and what
             they learn, stays as it is.
@@ -144,7 +144,7 @@ class POPL:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from :meth:`state_dict`, bit for bit."""
+        """Continue from ``state_dict``, bit for bit."""
         self.generation = int(state["generation"])
         self.population.members.data.update_(state["members"])
         self.variation.load_state_dict(state["variation"])

@@ -110,7 +110,7 @@ class Problem:
         the CPL loss with the opposite sign, so that E-steps and gradient steps agree.
 
         Args:
-            scores: As of :meth:`scores`, ``[N, segments]``.
+            scores: As of ``scores``, ``[N, segments]``.
 
         Returns:
             ``[N, M]``.
@@ -143,7 +143,7 @@ class Method(Protocol):
     """What learns a set of hypotheses, generation by generation.
 
     A class is built as ``Factory(problem, generator=generator, **sections, **options)``: sections
-    are the dataclasses of :mod:`popl_rl.config` that ``method.reads`` names, beside ``training``,
+    are the dataclasses of ``popl_rl.config`` that ``method.reads`` names, beside ``training``,
     which is in the problem; options are ``method.options``.
 
     Attributes:
@@ -172,5 +172,5 @@ class Method(Protocol):
         ...
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from :meth:`state_dict`, bit for bit."""
+        """Continue from ``state_dict``, bit for bit."""
         ...

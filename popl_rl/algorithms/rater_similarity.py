@@ -113,7 +113,7 @@ def seed_with_specialists(
         generator: Source of randomness.
 
     Returns:
-        The raters' :func:`rater_similarity`, ``[C, C]``.
+        The raters' ``rater_similarity``, ``[C, C]``.
     """
     order = torch.randperm(comparisons.num_cases, generator=generator, device=generator.device)
     raters = order[:_MOST]

@@ -63,7 +63,7 @@ def brex_set(
     keep: int = 1000,
     generator: torch.Generator,
 ) -> RewardSet:
-    """Samples of B-REX's posterior (:func:`~popl_rl.algorithms.brex.brex`), as a set to cater from.
+    """Samples of B-REX's posterior (``popl_rl.algorithms.brex.brex``), as a set to cater from.
 
     Args:
         spec: Sizes of the reward functions; its hidden layers are replaced by one of 512 frozen

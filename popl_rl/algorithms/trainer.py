@@ -1,9 +1,9 @@
 """POPL as a TorchRL Trainer: generations, checkpoints, and resuming to the bit.
 
 A frame of the Trainer is a generation: its collector yields one empty batch for each, and its
-optimisation step is :meth:`POPL.step <popl_rl.algorithms.popl.POPL.step>`. What that buys over a
-loop of five lines is TorchRL's hooks (``register_op``, ``EarlyStopping``, ``request_stop``) and its
-registration of everything that has a state in one checkpoint.
+optimisation step is ``popl_rl.algorithms.popl.POPL.step``. What that buys over a loop of five lines
+is TorchRL's hooks (``register_op``, ``EarlyStopping``, ``request_stop``) and its registration of
+everything that has a state in one checkpoint.
 """
 
 import re

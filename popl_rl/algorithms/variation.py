@@ -42,7 +42,7 @@ class Variation(Protocol):
         ...
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore :meth:`state_dict`."""
+        """Restore ``state_dict``."""
         ...
 
 
@@ -92,7 +92,7 @@ class GaussianHead:
         self._write(flat / flat.norm(dim=1, keepdim=True))
 
     def __call__(self, parents: Tensor, strength: Tensor) -> dict[str, float]:  # noqa: ARG002
-        """See :class:`Variation`; ``strength`` is not used."""
+        """See ``Variation``; ``strength`` is not used."""
         self.population.replace_(parents)
         flat = self._flat()
         shape, source, device = (len(flat), 1), self.generator, flat.device
@@ -163,7 +163,7 @@ class GradientCPL:
         )
 
     def __call__(self, parents: Tensor, strength: Tensor) -> dict[str, float]:
-        """See :class:`Variation`."""
+        """See ``Variation``."""
         self.loss.population.replace_(parents)
         inherit_moments(self.optimizer, parents)
         # A child of one that is strong nowhere still needs something: everything, a bit.

@@ -222,7 +222,7 @@ class VPL:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from :meth:`state_dict`, bit for bit."""
+        """Continue from ``state_dict``, bit for bit."""
         self.generation = int(state["generation"])
         self.encoder.load_state_dict(state["encoder"])
         self.network.load_state_dict(state["network"])

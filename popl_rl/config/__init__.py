@@ -1,8 +1,9 @@
 """Settings, with their defaults and what they mean. Imports neither torch nor TorchRL.
 
 ``data``: environment, raters and segments; ``method``: methods, a section for each part;
-``evaluation``: how the result is evaluated; ``run``: a whole run; ``pages``: what people answer on;
-``checks``: how they check themselves; ``unread``: settings that the chosen method does not read.
+``evaluation``: how the result is evaluated; ``run``: a whole run; ``stored``: those of an earlier
+run; ``pages``: what people answer on; ``checks``: how they check themselves; ``unread``: settings
+that the chosen method does not read.
 """
 
 from popl_rl.config.checks import Checker, parse_epsilon
@@ -27,6 +28,7 @@ from popl_rl.config.pages import (
     ServeSettings,
 )
 from popl_rl.config.run import Config, EvaluateConfig, LoggerConfig, plain, validate
+from popl_rl.config.stored import load_config
 from popl_rl.config.unread import unread
 
 __all__ = [
@@ -53,6 +55,7 @@ __all__ = [
     "ServeSettings",
     "Training",
     "VPLSettings",
+    "load_config",
     "parse_epsilon",
     "plain",
     "unread",

@@ -157,6 +157,8 @@ class VPLSettings:
         at.not_negative(self, "kl")
 
 
+_POPL = "popl_rl.algorithms.assembly:build_popl"
+
 #: Sections of ``method`` by name: what ``method.reads`` may list.
 SECTIONS = {
     "training": Training,
@@ -174,9 +176,10 @@ class MethodConfig:
     """How hypotheses are learnt: the method, what it evolves, and a section for each part."""
 
     name: str = "popl"  # what its rows are called in results.csv
-    factory: str = "popl_rl.algorithms.assembly:build_popl"  # reference of kind method
-    # Sections that the method is built from; settings of others are refused.
-    reads: list[str] = field(default_factory=lambda: ["training", "popl", "refinement", "mixture"])
+    factory: str = _POPL  # reference of kind method
+    # Sections that the method is built from; settings of others are refused. null: those of POPL
+    # for its own factory, and training alone for any other.
+    reads: list[str] | None = None
     needs_ids: bool = False  # whether the method lives on rater ids
     learns: str = "auto"  # policy, reward; auto: reward where there is nothing to do but judge
     cases: str = "rater"  # what lexicase filters on: rater (needs rater ids) or preference
@@ -194,11 +197,19 @@ class MethodConfig:
     vpl: VPLSettings = field(default_factory=VPLSettings)
     options: dict[str, Any] = field(default_factory=dict)  # further arguments of the factory
 
+    def sections(self) -> list[str]:
+        """Sections that the method is built from."""
+        if self.reads is not None:
+            return list(self.reads)
+        if self.factory == _POPL:
+            return ["training", "popl", "refinement", "mixture"]
+        return ["training"]
+
     def check(self, at: Checker) -> None:
         """Report values that are out of range, or do not go together."""
         at.expect(bool(self.name), "name", "a name", self.name)
         at.expect(bool(self.factory), "factory", "a reference of a method", self.factory)
-        unknown = [name for name in self.reads if name not in SECTIONS]
+        unknown = [name for name in self.sections() if name not in SECTIONS]
         at.expect(not unknown, "reads", f"sections out of {', '.join(SECTIONS)}", unknown)
         at.one_of(self, "learns", ("auto", "policy", "reward"))
         at.expect(self.cases in ("rater", "preference"), "cases", "rater or preference", self.cases)
@@ -214,7 +225,7 @@ class MethodConfig:
         at.expect(self.cases == "rater" or not self.needs_ids, "cases", cure, self.cases)
         if self.evolve == "code":
             at.expect(self.learns != "reward", "learns", "policy for style codes", self.learns)
-        if "popl" not in self.reads:
+        if "popl" not in self.sections():
             return
         at.expect(self.members >= 2, "members", "at least 2, to select among", self.members)
         if self.popl.variation == "gaussian":

@@ -32,10 +32,10 @@ def unread(
         if section == "clone":
             if method.evolve != "code":
                 problems.append(f"{key} is read with method.evolve=code alone, got {method.evolve}")
-        elif section not in method.reads:
+        elif section not in method.sections():
             others = ", ".join(name for name, reads in readers.items() if section in reads)
             problems.append(
                 f"{key} is not read by method {method.name!r}, which reads "
-                f"{', '.join(method.reads)}; it is read by {others or 'no known method'}"
+                f"{', '.join(method.sections())}; it is read by {others or 'no known method'}"
             )
     return problems

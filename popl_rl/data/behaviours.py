@@ -34,7 +34,7 @@ def table_behaviour(probabilities: Tensor, *, first: int = 0) -> Behaviour:
 
     Args:
         probabilities: ``[S, A]``.
-        first: The action of the first column, see :func:`first_action`.
+        first: The action of the first column, see ``first_action``.
     """
 
     def act(step: TensorDictBase, generator: torch.Generator) -> Tensor:

@@ -1,8 +1,8 @@
 """Environments as a run uses them, and what each offers beyond Gymnasium's interface.
 
 Where actions are ``Discrete(n, start)``, everything about an environment (its steps, its table, its
-behaviours, segments) has them from ``start`` on; :func:`indexed` and :func:`counting_from_zero` are
-the border to learners, who count them from 0.
+behaviours, segments) has them from ``start`` on; ``indexed`` and ``counting_from_zero`` are the
+border to learners, who count them from 0.
 """
 
 import fnmatch
@@ -17,7 +17,6 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from popl_rl.config import EnvConfig
 from popl_rl.data.behaviours import (
     Behaviour,
     first_action,
@@ -32,10 +31,10 @@ __all__ = [
     "Collect",
     "World",
     "behaviour_shares",
-    "build_world",
     "counting_from_zero",
     "indexed",
     "is_stateless",
+    "make_world",
 ]
 
 MakeEnv = Callable[[], gymnasium.Env[Any, Any]]
@@ -80,34 +79,48 @@ class World:
     collect: Collect | None = None
 
 
-def build_world(config: EnvConfig) -> World:
+def make_world(
+    factory: str,
+    *,
+    env_id: str | None = None,
+    options: Mapping[str, Any] | None = None,
+    data_options: Mapping[str, Any] | None = None,
+    mixture: Mapping[str, float] | None = None,
+) -> World:
     """Resolve an environment and read off what it offers.
 
     An environment is any Gymnasium environment. Three methods are used if it has them:
-    ``transition_table()`` (exact regret labels), ``behaviours()`` (what the data shows: by
-    name, tables ``[S, A]`` of action probabilities or functions; uniformly random otherwise), and
-    ``collect_segments(...)`` (see :class:`Collect`), which collects the data itself.
+    ``transition_table()`` (exact regret labels), ``behaviours()`` (what the data shows: by name,
+    tables ``[S, A]`` of action probabilities or functions; uniformly random otherwise), and
+    ``collect_segments(...)`` (see ``Collect``), which collects the data itself.
+
+    Args:
+        factory: Reference of kind ``env``.
+        env_id: First argument of the factory, such as a Gymnasium id; None for none.
+        options: Further arguments of the factory.
+        data_options: What differs from these where segments are collected.
+        mixture: Shares of the behaviours, see ``behaviour_shares``.
 
     Raises:
         ValueError: If the environment cannot be resolved or built, or ``mixture`` names behaviours
             that it does not have.
         TypeError: If it has no behaviours and its actions cannot be drawn at random, see
-            :func:`~popl_rl.data.behaviours.random_behaviour`.
+            ``popl_rl.data.behaviours.random_behaviour``.
     """
-    factory = cast("Callable[..., gymnasium.Env[Any, Any]]", resolve("env", config.factory))
-    leading = () if config.id is None else (config.id,)
+    make_env = cast("Callable[..., gymnasium.Env[Any, Any]]", resolve("env", factory))
+    leading = () if env_id is None else (env_id,)
 
     def build(options: dict[str, Any]) -> gymnasium.Env[Any, Any]:
         try:
-            env = factory(*leading, **options)
+            env = make_env(*leading, **options)
         except (TypeError, gymnasium.error.Error) as error:
             raise ValueError(
-                f"env.factory {config.factory!r} cannot be built with id {config.id!r} and options "
+                f"env.factory {factory!r} cannot be built with id {env_id!r} and options "
                 f"{options}: {error}"
             ) from error
         if not isinstance(env, gymnasium.Env):
             raise ValueError(
-                f"env.factory {config.factory!r} must return a gymnasium.Env, got {type(env)}"
+                f"env.factory {factory!r} must return a gymnasium.Env, got {type(env)}"
             )
         if isinstance(env.action_space, gymnasium.spaces.Box):
             # A Gaussian policy's mean knows no bounds. Gymnasium's own ClipAction would hide the
@@ -117,10 +130,10 @@ def build_world(config: EnvConfig) -> World:
         return env
 
     def make() -> gymnasium.Env[Any, Any]:
-        return build(dict(config.options))
+        return build(dict(options or {}))
 
     def make_for_data() -> gymnasium.Env[Any, Any]:
-        return build({**config.options, **config.data_options})
+        return build({**(options or {}), **(data_options or {})})
 
     env = make()
     inner = env.unwrapped
@@ -131,7 +144,7 @@ def build_world(config: EnvConfig) -> World:
         name: table_behaviour(what, first=first) if isinstance(what, Tensor) else what
         for name, what in given.items()
     } or {"random": random_behaviour(env.action_space)}
-    shares = behaviour_shares(list(behaviours), config.mixture)
+    shares = behaviour_shares(list(behaviours), mixture)
     collect = None
     if hasattr(inner, "collect_segments"):
         collect = cast("Any", make_for_data().unwrapped).collect_segments

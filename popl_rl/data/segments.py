@@ -24,7 +24,7 @@ def cut_segments(episodes: TensorDictBase, length: int) -> TensorDict:
     left over at the start are dropped.
 
     Args:
-        episodes: Output of :func:`~popl_rl.data.rollouts.lockstep`, ``[B, H]``.
+        episodes: Output of ``popl_rl.data.rollouts.lockstep``, ``[B, H]``.
         length: Steps T of a segment.
 
     Returns:

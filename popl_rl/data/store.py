@@ -33,12 +33,12 @@ def stored(path: Path, about: Mapping[str, Any], make: Callable[[], TensorDictBa
     another could mistake for data, and starts again.
 
     Args:
-        path: A folder, as of :func:`store_path`.
-        about: What :func:`store_path` was told; kept in ``about.json``.
+        path: A folder, as of ``store_path``.
+        about: What ``store_path`` was told; kept in ``about.json``.
         make: Makes the segments ``[N, T]``.
 
     Returns:
-        Folder of the segments, for :func:`~popl_rl.storage.load_tensordict`.
+        Folder of the segments, for ``popl_rl.storage.load_tensordict``.
 
     Raises:
         ValueError: If the folder holds something else.

@@ -1,4 +1,4 @@
-"""Exact planning in a small environment whose every transition is listed in a :class:`Table`.
+"""Exact planning in a small environment whose every transition is listed in a ``Table``.
 
 An environment that can list its transitions gives raters exact optimal advantages (labels by
 regret) and gives an evaluation exact returns, without a rollout.
@@ -24,8 +24,8 @@ class Table:
 
     Attributes:
         steps: TensorDict of batch size ``[S, A]``: every (state, action) as the one step it is,
-            under the keys of a segment (see :mod:`popl_rl.keys`), so that a rater judges a table
-            with the code that judges segments. ``("info", "state")`` is the index of the state.
+            under the keys of a segment (see ``popl_rl.keys``), so that a rater judges a table with
+            the code that judges segments. ``("info", "state")`` is the index of the state.
         next_state: ``[S, A]`` int64, the state that follows. Where the step is terminal nothing
             acts in it.
         terminal: ``[S, A]`` bool, whether the step ends the episode.

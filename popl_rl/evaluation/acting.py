@@ -8,7 +8,6 @@ import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from popl_rl.config import EnvConfig, EvaluationConfig
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.behaviours import random_behaviour
 from popl_rl.data.environments import World, counting_from_zero
@@ -26,6 +25,8 @@ from popl_rl.randomness import stream
 
 __all__ = ["Acting", "Choosing", "Optimising", "Planning", "Rolling", "plan"]
 
+_HIDDEN = (64, 64)  # units of the policies that PPO trains
+
 
 class Acting(Protocol):
     """Shows what hypotheses do."""
@@ -40,18 +41,20 @@ class Rolling:
 
     Args:
         world: Where to roll out.
-        env: Episode length.
-        config: Episodes, and whether to act greedily.
+        episodes: Episodes of each policy.
+        max_steps: Steps after which an episode is cut.
+        greedy: Whether to take the most likely actions instead of sampled ones.
         seed: Seed of starts and actions.
     """
 
     def __init__(
-        self, world: World, env: EnvConfig, config: EvaluationConfig, *, seed: int
+        self, world: World, *, episodes: int, max_steps: int, greedy: bool = False, seed: int
     ) -> None:
-        self.world, self.env, self.config, self.seed = world, env, config, seed
+        self.world, self.episodes, self.max_steps = world, episodes, max_steps
+        self.greedy, self.seed = greedy, seed
 
     def __call__(self, hypotheses: HypothesisSet | None) -> TensorDict:
-        """See :class:`Acting`."""
+        """See ``Acting``."""
         return self._roll(self.policies(hypotheses))
 
     def policies(self, hypotheses: HypothesisSet | None) -> PolicySet | Tensor | None:
@@ -77,10 +80,10 @@ class Rolling:
         return roll_out(
             self.world.make,
             policies,
-            episodes=self.config.episodes,
-            max_steps=self.env.max_steps,
+            episodes=self.episodes,
+            max_steps=self.max_steps,
             seed=self.seed,
-            greedy=self.config.greedy,
+            greedy=self.greedy,
             random_action=random_behaviour(self.world.env.action_space),
         )
 
@@ -92,7 +95,7 @@ class Planning(Rolling):
     """
 
     def policies(self, hypotheses: HypothesisSet | None) -> PolicySet | Tensor | None:
-        """See :meth:`Rolling.policies`."""
+        """See ``Rolling.policies``."""
         if not isinstance(hypotheses, RewardSet):
             return super().policies(hypotheses)
         if self.world.table is None:
@@ -108,50 +111,54 @@ class Optimising(Rolling):
 
     Args:
         world: Where to train and roll out.
-        env: Episode length.
-        config: Episodes, and frames of PPO.
+        episodes: Episodes of each policy.
+        max_steps: Steps after which an episode is cut.
+        greedy: Whether to take the most likely actions instead of sampled ones.
         seed: Seed of everything random.
-        bank: Segments, of whose steps the best is worth 0, as in :func:`plan`.
+        frames: Frames of PPO for each reward function.
+        bank: Segments, of whose steps the best is worth 0, as in ``plan``.
         progress: Called with the number of policies trained so far.
     """
 
     def __init__(
         self,
         world: World,
-        env: EnvConfig,
-        config: EvaluationConfig,
         *,
+        episodes: int,
+        max_steps: int,
+        greedy: bool = False,
         seed: int,
+        frames: int,
         bank: SegmentBank,
         progress: Callable[[int], None] | None = None,
     ) -> None:
-        super().__init__(world, env, config, seed=seed)
-        self.bank = bank
+        super().__init__(world, episodes=episodes, max_steps=max_steps, greedy=greedy, seed=seed)
+        self.frames, self.bank = frames, bank
         self.progress = progress
         self._trained: dict[bytes, Population] = {}
 
     def policies(self, hypotheses: HypothesisSet | None) -> PolicySet | Tensor | None:
-        """See :meth:`Rolling.policies`."""
+        """See ``Rolling.policies``."""
         if not isinstance(hypotheses, RewardSet):
             return super().policies(hypotheses)
         trained = [self._policy(hypotheses, member) for member in range(len(hypotheses))]
         networks = [population.network(0) for population in trained]
-        return PolicySet(Population(networks, trained[0].spec))
+        return PolicySet(Population(networks, PolicySpec.from_env(self.world.env, hidden=_HIDDEN)))
 
     def _policy(self, rewards: RewardSet, member: int) -> Population:
         own = rewards.population.members.data[member].values(True, True)
         key = b"".join(value.cpu().numpy().tobytes() for value in own)
         if key not in self._trained:
             # PPO's policies choose actions as reward functions judge them: counted from 0.
-            spec = PolicySpec.from_env(self.world.env, hidden=(64, 64))
+            spec = PolicySpec.from_env(counting_from_zero(self.world.env), hidden=_HIDDEN)
             best = rewards.subset([member]).reward(self.bank.observation).max()
             reward = reward_of(rewards, member)
             self._trained[key] = train_ppo(
                 lambda: counting_from_zero(self.world.make()),
                 lambda observation, action: reward(observation, action) - best,
                 spec,
-                frames=self.config.ppo_frames,
-                max_steps=self.env.max_steps,
+                frames=self.frames,
+                max_steps=self.max_steps,
                 generator=stream(self.seed, "ppo"),
             )
             if self.progress is not None:
@@ -168,19 +175,19 @@ class Choosing:
     Args:
         segments: Items ``[N, T]``.
         bank: The same items, as hypotheses read them.
-        config: Menus (``episodes``) and items on each (``menu``).
+        menus: Menus E to choose from.
+        items: Items on each of them.
         seed: Seed of the menus.
     """
 
     def __init__(
-        self, segments: TensorDictBase, bank: SegmentBank, config: EvaluationConfig, *, seed: int
+        self, segments: TensorDictBase, bank: SegmentBank, *, menus: int, items: int, seed: int
     ) -> None:
         self.segments, self.bank = segments, bank
-        shape = (config.episodes, config.menu)
-        self.menus = torch.randint(len(bank), shape, generator=stream(seed, "menus"))
+        self.menus = torch.randint(len(bank), (menus, items), generator=stream(seed, "menus"))
 
     def __call__(self, hypotheses: HypothesisSet | None) -> TensorDict:
-        """See :class:`Acting`; random choice takes each menu's first item."""
+        """See ``Acting``; random choice takes each menu's first item."""
         if hypotheses is None:
             return self._episodes(self.menus[:, 0].unsqueeze(0))
         scores = segment_scores(

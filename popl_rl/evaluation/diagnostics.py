@@ -24,7 +24,7 @@ def diagnostics(board: Scoreboard, evaluator: Evaluator) -> dict[str, str]:
 
     Returns:
         Sentences by what they are about: ``new raters' further answers``, how well they are met;
-        ``alarm``, see :func:`alarm`; ``oracle``, if one is far from the optimum of its group;
+        ``alarm``, see ``alarm``; ``oracle``, if one is far from the optimum of its group;
         ``collapse``, if groups were given the same hypothesis; ``hidden context``, DPL's detector,
         if it ran; ``majority``, if the groups, pooled in equal shares, prefer states in a circle,
         so that no single utility can say what they want.

@@ -14,9 +14,9 @@ recoveries has a ``share_of_optimum`` beside it, from exact returns instead of r
 For the group ``all``: ``worst_recovery, worst_share_of_optimum`` and ``coverage`` of the groups.
 For a set also the number of ``distinct`` and ``effective`` members; how well it meets held-out
 raters whose groups nobody looks at (``further_accuracy, one_for_all_accuracy, gain, gain_error,
-favourite_share``, see :mod:`popl_rl.evaluation.held_out_raters`); and of the fair choice of one
-panel of held-out raters, its accuracy for the worst rater of another panel (``fair_worst_rater``)
-and the 10 % quantile (``fair_quantile``), and its recovery for the group that it serves worst
+favourite_share``, see ``popl_rl.evaluation.held_out_raters``); and of the fair choice of one panel
+of held-out raters, its accuracy for the worst rater of another panel (``fair_worst_rater``) and the
+10 % quantile (``fair_quantile``), and its recovery for the group that it serves worst
 (``fair_recovery``).
 """
 
@@ -28,7 +28,6 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from popl_rl.algorithms.reward_baselines import RewardBaselines
-from popl_rl.config import EnvConfig, EvaluationConfig
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.evaluation.acting import Acting, Choosing, Optimising, Rolling
@@ -41,6 +40,7 @@ from popl_rl.evaluation.measures import (
     new_rater_answers,
 )
 from popl_rl.evaluation.optimum import ExactReturns
+from popl_rl.evaluation.protocol import EvaluationProtocol, MeasuredInfos
 from popl_rl.evaluation.results import Performance, Rows, Scoreboard, Served
 from popl_rl.keys import RATER
 from popl_rl.models.hypothesis_set import HypothesisSet
@@ -62,11 +62,11 @@ class Evaluator:
 
     Args:
         acting: Shows what hypotheses do.
-        env: Which infos mean success and doors.
-        config: How many answers, raters and pairs.
         groups: G groups.
         bank: N segments to evaluate on.
         segment_utility: Utility of each segment to each group, ``[G, N]``.
+        protocol: How many answers, raters and pairs.
+        infos: Which infos mean success and doors.
         pool: Pairs to evaluate on; all pairs of the N segments if None.
         clone: A clone of the data's typical behaviour, for comparison; None for none.
         shares: Chance that a rater is of each group; equal if None.
@@ -76,25 +76,25 @@ class Evaluator:
     def __init__(
         self,
         acting: Acting,
-        env: EnvConfig,
-        config: EvaluationConfig,
         groups: Sequence[RaterGroup],
         bank: SegmentBank,
         segment_utility: Tensor,
         *,
+        protocol: EvaluationProtocol,
+        infos: MeasuredInfos,
         pool: PairPool | None = None,
         clone: HypothesisSet | None = None,
         shares: Sequence[float] | None = None,
         seed: int,
     ) -> None:
-        self.acting, self.env, self.config = acting, env, config
+        self.acting, self.protocol, self.infos = acting, protocol, infos
         self.groups, self.bank, self.segment_utility = groups, bank, segment_utility
         self.pool, self.clone = pool, clone
         self.shares, self.seed = shares, seed
         generator = stream(seed, "held-out pairs")
         self.pairs = {
             index: held_out_pairs(
-                segment_utility, index, count=config.pairs, pool=pool, generator=generator
+                segment_utility, index, count=protocol.pairs, pool=pool, generator=generator
             )
             for index in range(len(groups))
         }
@@ -102,7 +102,7 @@ class Evaluator:
         self._policies = acting.policies if isinstance(acting, Rolling) else None
         if isinstance(acting, Rolling) and acting.world.table is not None:
             self._exact = ExactReturns(
-                acting.world.table, groups, horizon=env.max_steps, greedy=config.greedy
+                acting.world.table, groups, horizon=acting.max_steps, greedy=acting.greedy
             )
 
     def scores(self, hypotheses: HypothesisSet) -> Tensor:
@@ -130,7 +130,7 @@ class Evaluator:
 
         Each answers as often as any point of a curve needs; fewer answers are the first of these.
         """
-        answers = max([self.config.answers, *self.config.curve])
+        answers = max([self.protocol.answers, *self.protocol.curve])
         said = []
         for index in range(len(self.groups)):
             generator = stream(self.seed, f"new raters/{index}")
@@ -144,7 +144,7 @@ class Evaluator:
                         pool=self.pool,
                         generator=generator,
                     )
-                    for _ in range(self.config.new_raters)
+                    for _ in range(self.protocol.new_raters)
                 ]
             )
         return said
@@ -156,10 +156,10 @@ class Evaluator:
 
         Args:
             hypotheses: What is chosen from.
-            method: How, see :meth:`~popl_rl.models.hypothesis_set.HypothesisSet.cater`.
+            method: How, see ``popl_rl.models.hypothesis_set.HypothesisSet.cater``.
             answers: Answers that are known of each; as configured if None.
         """
-        known = self.config.answers if answers is None else answers
+        known = self.protocol.answers if answers is None else answers
         picks = []
         for index, raters in enumerate(self.new_raters):
             draw = stream(self.seed, f"lexicase catering/{index}/{known}")
@@ -181,7 +181,7 @@ class Evaluator:
             draw_held_out_raters(
                 self.groups,
                 self.segment_utility,
-                raters=_PANEL * self.config.new_raters,
+                raters=_PANEL * self.protocol.new_raters,
                 answers=_PANEL_ANSWERS,
                 shares=self.shares,
                 pool=self.pool,
@@ -206,7 +206,7 @@ class Evaluator:
             baselines: One trained on everybody's answers, then one oracle per group; None to leave
                 them, and with them ``recovery``, out.
             reward_baselines: Other learners of reward functions, for
-                :class:`~popl_rl.evaluation.acting.Choosing` alone.
+                ``popl_rl.evaluation.acting.Choosing`` alone.
             label: Name of the method that found ``hypotheses``.
         """
         random = self._perform(None)
@@ -215,7 +215,7 @@ class Evaluator:
         rows = self._rows(random, cloned, base)
         pooled_scores = None if baselines is None else self.scores(baselines)[0]
         # Curves of what is evaluated; what it is compared with has too many members for them.
-        curve = sorted(set(self.config.curve))
+        curve = sorted(set(self.protocol.curve))
         served = self._serve(hypotheses, label, rows, curve=curve)
         self._score_as_a_whole(hypotheses, label, rows, served, pooled_scores)
         catered: dict[str, int] = {}
@@ -251,15 +251,15 @@ class Evaluator:
         """Rows to fill, which know the returns that are a recovery of 0 and of 1."""
         # Return of each oracle, in the rows, to each group.
         returns = None if base is None else group_returns(base.episodes[1:], self.groups)
-        if self.config.reference == "others" and returns is not None:
+        if self.protocol.reference == "others" and returns is not None:
             own = torch.eye(len(returns), dtype=torch.bool)
             floor = returns.masked_fill(own, torch.inf).amin(0)
-        elif self.config.reference == "clone" and cloned is not None:
+        elif self.protocol.reference == "clone" and cloned is not None:
             floor = group_returns(cloned.episodes, self.groups)[0]
         else:
             floor = group_returns(random.episodes, self.groups)[0]
         oracle = torch.full_like(floor, torch.nan) if returns is None else returns.diagonal()
-        return Rows(self.groups, self.env, floor=floor, oracle=oracle, exact=self._exact)
+        return Rows(self.groups, self.infos, floor=floor, oracle=oracle, exact=self._exact)
 
     def _serve(
         self, found: HypothesisSet, label: str, rows: Rows, *, curve: Sequence[int]
@@ -276,7 +276,7 @@ class Evaluator:
         accurate = accuracy.argmax(0)
         always = [*picks.values(), accurate, fair]
         # A member more costs a training of PPO more, where that is how members act.
-        limit = 0 if isinstance(self.acting, Optimising) else self.config.curve_members
+        limit = 0 if isinstance(self.acting, Optimising) else self.protocol.curve_members
         members = to_roll(always, points, limit=limit)
         done = self._perform(found.subset(members))
         served = Served(picks, members, done, int(fair))
@@ -343,7 +343,7 @@ class Evaluator:
         """What a set is worth to raters whose group nobody knows: rows of the group ``all``."""
         choosing, measuring = self.held_out
         other = measuring.clone()
-        other[RATER] = other[RATER] + _PANEL * self.config.new_raters
+        other[RATER] = other[RATER] + _PANEL * self.protocol.new_raters
         everybody = Comparisons.from_preferences(torch.cat([choosing, other]), cases="rater")
         judging = Comparisons.from_preferences(measuring, cases="rater")
         scores = self.scores(found)

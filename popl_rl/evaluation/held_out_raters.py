@@ -62,7 +62,7 @@ def draw_held_out_raters(
         TensorDict ``[R * K]`` with ``pair``, ``answer`` and ``rater``, rater after rater.
 
     Raises:
-        ValueError: As :func:`~popl_rl.evaluation.measures.new_rater_answers`.
+        ValueError: As ``popl_rl.evaluation.measures.new_rater_answers``.
     """
     people = Raters.draw(groups, num_raters=raters, shares=shares, generator=generator)
     said = [

@@ -11,6 +11,7 @@ from torch import Tensor
 from popl_rl.data.behaviours import first_action
 from popl_rl.data.rollouts import MASK, lockstep
 from popl_rl.keys import ANSWER, INFO, OBSERVATION, PAIR, Answer
+from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.raters.groups import RaterGroup
 from popl_rl.raters.pairs import PairPool
@@ -53,8 +54,8 @@ def roll_out(
         random_action: A behaviour to roll without policies.
 
     Returns:
-        TensorDict ``[P, E, H]`` as from :func:`~popl_rl.data.rollouts.lockstep`; discrete actions
-        are those of the environment, which need not begin with 0.
+        TensorDict ``[P, E, H]`` as from ``popl_rl.data.rollouts.lockstep``; discrete actions are
+        those of the environment, which need not begin with 0.
 
     Raises:
         ValueError: If ``episodes`` or ``max_steps`` is not positive, or there is nothing to roll.
@@ -78,12 +79,15 @@ def roll_out(
         if policies is not None:
             observation = step[OBSERVATION].view(count, episodes, -1).to(device)
             action = policies.act(observation, greedy=greedy, generator=generator)
-            return first + action.flatten(0, 1).cpu()
+            return moved + action.flatten(0, 1).cpu()
         assert random_action is not None
         return random_action(step, generator)
 
     envs = [make_env() for _ in range(count * episodes)]
     first = first_action(envs[0].action_space)
+    # Sets that were saved before their actions were the environment's count them from 0.
+    spec = policies.population.spec if isinstance(policies, PolicySet) else None
+    moved = first - spec.first_action if isinstance(spec, PolicySpec) else 0
     try:
         flat = lockstep(envs, act, seeds=starts * count, max_steps=max_steps)
     finally:

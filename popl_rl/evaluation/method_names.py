@@ -23,8 +23,8 @@ class ReportedMethod:
 
     Attributes:
         label: Name to print.
-        colour: Colour in figures, a key of :data:`popl_rl.plotting.style.PALETTE`; empty for
-            whatever colour is free.
+        colour: Colour in figures, a key of ``popl_rl.plotting.style.PALETTE``; empty for whatever
+            colour is free.
         is_reference: Whether it is evaluated beside the method that a run trains, so that no other
             method may have its name. The references with a colour are drawn in every figure.
     """

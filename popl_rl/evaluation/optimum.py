@@ -94,7 +94,7 @@ class ExactReturns:
         """Exact returns to every group.
 
         Args:
-            policies: See :func:`action_probabilities`.
+            policies: See ``action_probabilities``.
 
         Returns:
             ``[P, G]`` float64.

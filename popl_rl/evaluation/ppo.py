@@ -38,7 +38,7 @@ _ADVANTAGE = "advantage"
 
 
 def reward_of(rewards: RewardSet, member: int) -> RewardFunction:
-    """One reward function of a set, as :func:`train_ppo` takes it.
+    """One reward function of a set, as ``train_ppo`` takes it.
 
     Args:
         rewards: Reward functions.
@@ -124,7 +124,7 @@ def train_ppo(
         ValueError: If a number is out of its range, ``spec`` is not that of the environment, or
             ``reward`` gives another shape or a value that is not finite.
         TypeError: If the environment's spaces are of another kind than
-            :meth:`~popl_rl.models.policies.PolicySpec.from_env` takes, or ``reward`` gives no
+            ``popl_rl.models.policies.PolicySpec.from_env`` takes, or ``reward`` gives no
             floating-point tensor.
     """
     _check_numbers(

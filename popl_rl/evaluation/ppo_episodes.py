@@ -49,7 +49,7 @@ class Ending(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def clip_actions(space: gymnasium.Space[Any], action: Tensor) -> Tensor:
-    """Actions ``[B]`` or ``[B, A]`` as an :class:`Ending` carries them out, in the same shape."""
+    """Actions ``[B]`` or ``[B, A]`` as an ``Ending`` carries them out, in the same shape."""
     if not isinstance(space, gymnasium.spaces.Box):
         return action
     return action.clamp(torch.from_numpy(space.low), torch.from_numpy(space.high)).to(action.dtype)

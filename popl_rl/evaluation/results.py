@@ -8,7 +8,6 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from popl_rl.config import EnvConfig
 from popl_rl.evaluation.best_of_set import coverage, lowest
 from popl_rl.evaluation.measures import (
     group_returns,
@@ -19,6 +18,7 @@ from popl_rl.evaluation.measures import (
     success_rate,
 )
 from popl_rl.evaluation.optimum import ExactReturns
+from popl_rl.evaluation.protocol import MeasuredInfos
 from popl_rl.evaluation.statistics import RESULT_COLUMNS
 from popl_rl.raters.groups import RaterGroup
 
@@ -107,7 +107,7 @@ class Rows:
 
     Args:
         groups: G groups.
-        env: Which infos mean success and doors, and which are measured.
+        infos: Which infos mean success and doors, and which are measured.
         floor: Return to each group that is a recovery of 0, ``[G]``.
         oracle: Return of each group's oracle, ``[G]``; NaN where it is unknown.
         exact: Knows the optimum of each group; None without a transition table.
@@ -116,13 +116,13 @@ class Rows:
     def __init__(
         self,
         groups: Sequence[RaterGroup],
-        env: EnvConfig,
+        infos: MeasuredInfos,
         *,
         floor: Tensor,
         oracle: Tensor,
         exact: ExactReturns | None = None,
     ) -> None:
-        self.groups, self.env = groups, env
+        self.groups, self.infos = groups, infos
         self.floor, self.oracle, self.exact = floor, oracle, exact
         self.rows: list[tuple[str, str, str, str, float]] = []
 
@@ -140,18 +140,18 @@ class Rows:
         self.add_return(entry, index, value)
         if done.exact is not None:
             self.add_share(entry, index, float(done.exact[:, index] @ share.double()))
-        success = float(success_rate(rolled, self.env.success) @ share)
+        success = float(success_rate(rolled, self.infos.success) @ share)
         self.add_value(entry, index, "success", success)
-        if self.env.measured:
-            steps = float(steps_to_success(rolled, self.env.success) @ share)
+        if self.infos.measured:
+            steps = float(steps_to_success(rolled, self.infos.success) @ share)
             self.add_value(entry, index, "steps", steps)
-        for name in self.env.measured:
+        for name in self.infos.measured:
             for what, values in zip(("mean", "peak"), mean_and_peak(rolled, name), strict=True):
                 self.add_value(entry, index, f"{what}_{name}", float(values @ share))
-        if self.env.door is not None:
-            for door, rate in info_rates(rolled, self.env.door).items():
+        if self.infos.door is not None:
+            for door, rate in info_rates(rolled, self.infos.door).items():
                 if door >= 0:
-                    self.add_value(entry, index, f"{self.env.door}_{door}", float(rate @ share))
+                    self.add_value(entry, index, f"{self.infos.door}_{door}", float(rate @ share))
 
     def recovery(self, index: int, value: float) -> float:
         """What a return to a group is between the floor and the group's oracle."""

@@ -112,7 +112,7 @@ def summary(runs: Mapping[str, pd.DataFrame], *, measure: str = "recovery") -> p
 
     Args:
         runs: Tidy rows ``method, choice, group, measure, value`` of each run, by its name.
-        measure: What the worst group is looked for in, see :func:`headline_measure`.
+        measure: What the worst group is looked for in, see ``headline_measure``.
 
     Returns:
         A row for each method and choice with this measure: ``method``, ``choice``, ``runs``,

@@ -6,6 +6,6 @@
 - A run's folder: ``run_folder``, ``metrics``, ``loggers``, and its ``report``.
 - A benchmark: ``suites`` reads what is compared, ``cells`` plans it and collects what came out,
   ``jobs`` runs it in processes, ``benchmark_tables`` and ``benchmark_report`` tell the results.
-- ``steps``: the steps of a training run, in their order.
+- ``steps``: the steps of a training run, in their order; ``reevaluation`` of a finished one.
 - ``markdown`` lays out the tables of all reports, ``tables`` those of the README files.
 """

@@ -68,7 +68,7 @@ def write_report(
         run_dir: Folder of the benchmark.
         suite: The suite.
         cells: All cells that there should be.
-        results: Rows as of :func:`popl_rl.experiments.cells.collect`.
+        results: Rows as of ``popl_rl.experiments.cells.collect``.
         failures: What went wrong, by name of the cell.
     """
     write_atomic(run_dir / "results.csv", results.to_csv(index=False))
@@ -124,7 +124,7 @@ def benchmark_markdown(
 
     Args:
         suite: The suite.
-        results: Rows as of :func:`popl_rl.experiments.cells.collect`.
+        results: Rows as of ``popl_rl.experiments.cells.collect``.
         about: What was run, such as the number of seeds.
         missing: Cells that have no results, and why.
         figures: Pictures, relative to the folder of the report.

@@ -29,7 +29,7 @@ def recovery_table(suite: Suite, results: pd.DataFrame) -> tuple[list[str], list
 
     Args:
         suite: The suite.
-        results: Rows as of :func:`popl_rl.experiments.cells.collect`.
+        results: Rows as of ``popl_rl.experiments.cells.collect``.
 
     Returns:
         Names of the columns, and rows; a row for each scenario with the measure, a column for each
@@ -59,7 +59,7 @@ def catering_table(suite: Suite, results: pd.DataFrame) -> tuple[list[str], list
 
     Args:
         suite: The suite.
-        results: Rows as of :func:`popl_rl.experiments.cells.collect`.
+        results: Rows as of ``popl_rl.experiments.cells.collect``.
 
     Returns:
         Names of the columns, and rows; a row for each scenario and method with a set, with means

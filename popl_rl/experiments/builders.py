@@ -146,7 +146,9 @@ def build_method(
     config = plain(config)
     factory = resolve("method", config.factory)
     sections = {
-        name: getattr(config, name) for name in config.reads if name not in ("training", "clone")
+        name: getattr(config, name)
+        for name in config.sections()
+        if name not in ("training", "clone")
     }
     if "em" in sections and config.em.groups is None:
         sections["em"] = replace(config.em, groups=num_groups)

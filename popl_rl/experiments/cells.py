@@ -4,23 +4,26 @@ A *cell* is one run of ``popl-train``: a scenario of a suite, a method and a see
 scenario and seed see the same data, which the first of them makes.
 """
 
+import csv
+import io
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import pandas as pd
 from omegaconf import OmegaConf
 
-from popl_rl.evaluation.statistics import RESULT_COLUMNS, read_results
+from popl_rl.config import load_config
 from popl_rl.evaluation.suite import Suite
-from popl_rl.experiments.run_folder import load_config
 from popl_rl.storage import write_atomic, write_json
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = ["COLUMNS", "Cell", "claim", "collect", "is_finished", "plan"]
 
-COLUMNS = ["suite", "scenario", "seed", *RESULT_COLUMNS]
+COLUMNS = ["suite", "scenario", "seed", "method", "choice", "group", "measure", "value"]
 """Columns of a benchmark's ``results.csv``."""
 
 
@@ -130,11 +133,13 @@ def claim(run_dir: Path, suite: Suite, cells: Sequence[Cell]) -> None:
         raise ValueError(f"run_dir {run_dir} holds something else; choose another run_dir")
     else:
         write_json(kept, {"suite": suite.name})
-    rows = [(number, one.scenario, one.method, one.seed) for number, one in enumerate(cells)]
-    table = pd.DataFrame(rows, columns=["cell", "scenario", "method", "seed"])
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(["cell", "scenario", "method", "seed"])
+    writer.writerows([i, one.scenario, one.method, one.seed] for i, one in enumerate(cells))
     numbers = run_dir / "cells.csv"
-    if not numbers.is_file() or numbers.read_text(encoding="utf-8") != table.to_csv(index=False):
-        write_atomic(numbers, table.to_csv(index=False))
+    if not numbers.is_file() or numbers.read_text(encoding="utf-8") != table.getvalue():
+        write_atomic(numbers, table.getvalue())
 
 
 def is_finished(cell: Cell, run_dir: Path) -> bool:
@@ -172,7 +177,7 @@ def _without(one: Any, other: Any) -> Any:
     return one
 
 
-def collect(suite: Suite, cells: Sequence[Cell], run_dir: Path) -> pd.DataFrame:
+def collect(suite: Suite, cells: Sequence[Cell], run_dir: Path) -> "pd.DataFrame":
     """Put the results of finished cells together.
 
     The rows of what a cell trained, ``method.name`` of its configuration, get the name of its
@@ -189,9 +194,13 @@ def collect(suite: Suite, cells: Sequence[Cell], run_dir: Path) -> pd.DataFrame:
         Tidy rows ``suite, scenario, seed, method, choice, group, measure, value``.
 
     Raises:
-        ValueError: If a cell was run as something else, see :func:`is_finished`, or has rows of the
+        ValueError: If a cell was run as something else, see ``is_finished``, or has rows of the
             same name as another's.
     """
+    import pandas as pd
+
+    from popl_rl.evaluation.statistics import read_results
+
     tables = []
     for cell in cells:
         if not is_finished(cell, run_dir):

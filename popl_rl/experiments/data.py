@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
 from popl_rl.config import DataConfig, EnvConfig, RatersConfig
-from popl_rl.data.environments import World
+from popl_rl.data.environments import World, make_world
 from popl_rl.data.segments import collect_segments, segment_buffer, stored_segments
 from popl_rl.data.store import store_path, stored
 from popl_rl.keys import ACTION, GROUP, INFO, OBSERVATION
@@ -31,6 +31,7 @@ __all__ = [
     "Data",
     "Reader",
     "build_groups",
+    "build_world",
     "describe",
     "first_segments",
     "fresh_segments",
@@ -45,11 +46,28 @@ Reader = Callable[[Path], tuple[TensorDictBase, TensorDict]]
 _ABOUT = "about.json"
 
 
+def build_world(config: EnvConfig) -> World:
+    """The environment of a run, see ``popl_rl.data.environments.make_world``.
+
+    Raises:
+        ValueError: If the environment cannot be resolved or built, or ``env.mixture`` names
+            behaviours that it does not have.
+        TypeError: If it has no behaviours and its actions cannot be drawn at random.
+    """
+    return make_world(
+        config.factory,
+        env_id=config.id,
+        options=config.options,
+        data_options=config.data_options,
+        mixture=config.mixture,
+    )
+
+
 def build_groups(config: RatersConfig, world: World) -> tuple[RaterGroup, ...]:
     """Resolve the rater groups.
 
-    Regret is exact where the environment has a transition table; elsewhere :func:`make_data` fits
-    the value of a state to each group's utility, and until then groups compare returns.
+    Regret is exact where the environment has a transition table; elsewhere ``make_data`` fits the
+    value of a state to each group's utility, and until then groups compare returns.
 
     Raises:
         ValueError: If a group cannot be resolved.
@@ -71,7 +89,7 @@ class Data:
 
     Attributes:
         segments: Replay buffer of N segments, one item each.
-        preferences: TensorDict ``[M]``, see :mod:`popl_rl.keys`.
+        preferences: TensorDict ``[M]``, see ``popl_rl.keys``.
         segment_utility: Worth of each segment to each group, ``[G, N]``; for evaluation only.
         store: Folder that the segments are kept in for all runs, if they are.
         groups: Names of the groups that were asked, in the order of ``("hidden", "group")``.
@@ -110,7 +128,7 @@ class Data:
 
 
 def describe(env: EnvConfig, config: DataConfig, *, seed: int) -> dict[str, Any]:
-    """All that decides about the segments of a run, for :func:`~popl_rl.data.store.store_path`."""
+    """All that decides about the segments of a run, for ``popl_rl.data.store.store_path``."""
     names = ("factory", "id", "options", "data_options", "mixture", "max_steps")
     # A node of a larger configuration may refer to other nodes of it.
     node = env if isinstance(env, DictConfig) else OmegaConf.structured(env)

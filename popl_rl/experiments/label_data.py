@@ -6,10 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
-from popl_rl.config import DataConfig, EnvConfig
-from popl_rl.data.environments import build_world
-from popl_rl.experiments.data import Reader, first_segments
-from popl_rl.experiments.run_folder import load_config
+from popl_rl.config import DataConfig, EnvConfig, load_config
+from popl_rl.experiments.data import Reader, build_world, first_segments
 from popl_rl.registry import resolve
 from popl_rl.storage import save_tensordict, write_json, written_beside
 

@@ -22,7 +22,7 @@ __all__ = ["Progress", "RunLogger", "make_logger"]
 class RunLogger:
     """Where a run reports to, besides its own folder. This one reports nowhere.
 
-    Use it as a context manager, or call :meth:`close`.
+    Use it as a context manager, or call ``close``.
     """
 
     def log(self, metrics: Mapping[str, float], step: int) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from popl_rl.experiments.loggers import Progress, RunLogger, make_logger
 from popl_rl.storage import write_atomic, write_json
@@ -27,7 +27,6 @@ __all__ = [
     "RunLogger",
     "create_run_dir",
     "git_state",
-    "load_config",
     "make_logger",
     "save_config",
     "write_metadata",
@@ -96,27 +95,6 @@ def save_config(run_dir: Path, cfg: Any) -> None:
     if not OmegaConf.is_config(cfg):
         cfg = OmegaConf.create(cfg)
     write_atomic(run_dir / "config.yaml", OmegaConf.to_yaml(cfg, resolve=True))
-
-
-def load_config(run_dir: Path) -> DictConfig:
-    """Read ``config.yaml`` of a run.
-
-    Raises:
-        FileNotFoundError: If the folder has none.
-        ValueError: If it is not a mapping in YAML.
-    """
-    path = run_dir / "config.yaml"
-    if not path.is_file():
-        raise FileNotFoundError(f"{run_dir} has no config.yaml; give the folder of a run")
-    try:
-        cfg = OmegaConf.load(path)
-    except Exception as error:  # OmegaConf passes on whatever its YAML reader raises
-        raise ValueError(
-            f"{path} is not valid YAML ({error}); restore it or start again"
-        ) from error
-    if not isinstance(cfg, DictConfig):
-        raise ValueError(f"{path} must be a mapping of options to values, got {cfg!r}")
-    return cfg
 
 
 def write_metadata(run_dir: Path, *, command: Sequence[str]) -> None:

@@ -14,9 +14,9 @@ from omegaconf import OmegaConf
 from popl_rl.algorithms.problem import Method, Problem
 from popl_rl.algorithms.reward_baselines import RewardBaselines, train_reward_baselines
 from popl_rl.algorithms.trainer import MethodTrainer
-from popl_rl.config import Config, plain, validate
+from popl_rl.config import Config, load_config, plain, validate
 from popl_rl.data.comparisons import Comparisons
-from popl_rl.data.environments import World, build_world, indexed, is_stateless
+from popl_rl.data.environments import World, indexed, is_stateless
 from popl_rl.evaluation.diagnostics import diagnostics
 from popl_rl.evaluation.evaluator import Evaluator
 from popl_rl.evaluation.results import Scoreboard
@@ -27,14 +27,13 @@ from popl_rl.experiments.builders import (
     build_spec,
     train_baselines,
 )
-from popl_rl.experiments.data import Data, Reader, build_groups, make_data
+from popl_rl.experiments.data import Data, Reader, build_groups, build_world, make_data
 from popl_rl.experiments.evaluators import make_evaluator
 from popl_rl.experiments.loggers import Progress, RunLogger, make_logger
 from popl_rl.experiments.metrics import MetricsWriter
 from popl_rl.experiments.report import markdown
 from popl_rl.experiments.run_folder import (
     create_run_dir,
-    load_config,
     save_config,
     write_metadata,
 )
@@ -98,8 +97,13 @@ class References:
 def open_run(config: Config, *, command: Sequence[str]) -> tuple[Config, Path]:
     """Make the folder of a run, or find the one to continue with its own settings.
 
+    Args:
+        config: Settings that were checked; of a run that is continued, where it is.
+        command: What was typed, for ``metadata.json``.
+
     Raises:
-        ValueError: If settings are off.
+        ValueError: If the settings of the run that is continued are off, or those of a new one name
+            an environment, rater, method or reader that there is not.
         OSError: If the folder exists already, or there is no run to resume.
     """
     if config.resume is not None:
@@ -107,7 +111,7 @@ def open_run(config: Config, *, command: Sequence[str]) -> tuple[Config, Path]:
         config = plain(OmegaConf.merge(OmegaConf.structured(Config), load_config(run_dir)))
         validate(config)
     else:
-        validate(config)
+        _check_references(config)
         name = f"{config.method.name}-seed{config.seed}"
         wanted = None if config.run_dir is None else Path(config.run_dir)
         run_dir = create_run_dir(wanted, name=name)
@@ -116,6 +120,16 @@ def open_run(config: Config, *, command: Sequence[str]) -> tuple[Config, Path]:
     write_metadata(run_dir, command=command)
     torch.set_num_threads(config.threads)
     return config, run_dir
+
+
+def _check_references(config: Config) -> None:
+    """Raise for what cannot be resolved before there is a folder that a second try would find."""
+    resolve("env", config.env.factory)
+    resolve("method", config.method.factory)
+    for group in config.raters.groups:
+        resolve("rater", group)
+    if config.data.reader is not None:
+        resolve("reader", config.data.reader)
 
 
 def gather(config: Config, run_dir: Path) -> Setting:
@@ -259,6 +273,7 @@ def evaluate(
 
 
 def draw(
+    config: Config,
     setting: Setting,
     found: HypothesisSet,
     references: References,
@@ -276,6 +291,7 @@ def draw(
         evaluator=setting.evaluator,
         world=setting.world,
         reward_baselines=references.rewards,
+        with_animations=config.evaluation.animate,
     )
 
 

@@ -39,7 +39,7 @@ class ResultTable:
         """Rows that the table is made from.
 
         Args:
-            results: Rows with the columns :data:`COLUMNS`.
+            results: Rows with the columns ``COLUMNS``.
 
         Returns:
             Those of its suite, measure, scenarios and methods, one for each group.
@@ -64,7 +64,7 @@ class ResultTable:
         """Lay the table out.
 
         Args:
-            results: Rows with the columns :data:`COLUMNS`.
+            results: Rows with the columns ``COLUMNS``.
 
         Returns:
             The table; a cell is mean ± 95 % interval over seeds [lowest], or – without rows.
@@ -116,7 +116,7 @@ def rows_for(tables: Mapping[str, ResultTable], results: pd.DataFrame) -> pd.Dat
 
     Args:
         tables: Tables by name.
-        results: Rows with the columns :data:`COLUMNS`.
+        results: Rows with the columns ``COLUMNS``.
 
     Returns:
         Rows with these columns alone.

@@ -18,8 +18,8 @@ def fit_scale(margin: Tensor, comparisons: Comparisons, *, mistake: float = MIST
     Members are trained with scores of some scale, but what a rater's answers tell of two members
     depends on it: too small, and whoever has the largest margins wins with fewer answers on its
     side; too large, and the number of answers is all that counts. So a scale is fitted, as one
-    would fit the raters' rationality: each answer is predicted by the member that the rater's
-    other answers speak for, and the likelihood of all answers is maximised over :data:`SCALES`.
+    would fit the raters' rationality: each answer is predicted by the member that the rater's other
+    answers speak for, and the likelihood of all answers is maximised over ``SCALES``.
 
     Args:
         margin: Margins of the N members on M comparisons, ``[N, M]``.

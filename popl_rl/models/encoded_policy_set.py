@@ -118,7 +118,7 @@ class EncodedPolicySet(PolicySet):
             answers: TensorDict ``[K]`` with ``pair`` and ``answer``; ties and skips are ignored.
             method: ``"posterior"``: belief ``w_n ~ q(z_n | answers)`` of the encoder, and the one
                 believed in most, the nearest in units of the encoder's standard deviations.
-                ``"lexicase"``: as :meth:`PolicySet.cater`.
+                ``"lexicase"``: as ``PolicySet.cater``.
             mistake: Not used.
             generator: Source of the lexicase draw.
 

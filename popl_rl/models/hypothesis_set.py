@@ -168,11 +168,11 @@ class HypothesisSet:
         mistake: float = MISTAKE,
         generator: torch.Generator | None = None,
     ) -> Question | None:
-        """Choose what to ask one person next; see :mod:`popl_rl.models.questions`.
+        """Choose what to ask one person next; see ``popl_rl.models.questions``.
 
         Args:
             segments: What may be asked about. Of a TensorDict with
-                :data:`~popl_rl.keys.START`, only segments from the same start are compared.
+                ``popl_rl.keys.START``, only segments from the same start are compared.
             answers: TensorDict ``[K]`` with ``pair`` and ``answer``, the person's so far; None or
                 empty for none. Nothing is asked twice, ties and skips included.
             rule: ``"information_gain"``, ``"volume_removal"``, ``"expected_maximum"`` or
@@ -181,7 +181,7 @@ class HypothesisSet:
             candidates: How many to draw.
             enough: Belief in one behaviour from which on nothing is asked; above 1 for never.
             limit: Most questions in all; None for no limit.
-            mistake: Chance of a slip, as in :meth:`cater`.
+            mistake: Chance of a slip, as in ``cater``.
             generator: Source of the candidates, and of uniform choices.
 
         Returns:
@@ -280,7 +280,7 @@ class HypothesisSet:
         alpha: float,
         discount: float,
     ) -> Self:
-        """A set of these members, with what :meth:`_write_more` wrote at ``path``."""
+        """A set of these members, with what ``_write_more`` wrote at ``path``."""
         return cls(population, alpha=alpha, discount=discount)
 
     @classmethod
@@ -290,7 +290,7 @@ class HypothesisSet:
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Read what :meth:`save` wrote.
+        """Read what ``save`` wrote.
 
         Raises:
             FileNotFoundError: If there is no set of this kind at ``path``.

@@ -13,9 +13,10 @@ from torch.distributions import Categorical
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor
 
 from popl_rl.data.bank import SegmentBank
+from popl_rl.data.behaviours import first_action
 from popl_rl.keys import ACTION, OBSERVATION
 
-__all__ = ["PolicySpec", "Spec", "build_actor", "build_network", "log_prob"]
+__all__ = ["CategoricalFrom", "PolicySpec", "Spec", "build_actor", "build_network", "log_prob"]
 
 
 class Spec(Protocol):
@@ -72,6 +73,8 @@ class PolicySpec:
         action_std: Standard deviation of the Gaussian of a continuous policy. The default makes
             its log-density ``-|mu(s) - a|^2`` up to a constant, the form CPL uses (arXiv
             2310.13639, section 4). Unused when ``discrete``.
+        first_action: Action of the environment that the first output stands for, the start of its
+            ``Discrete`` space. Data that policies learn from are counted from 0 all the same.
     """
 
     observation_dim: int
@@ -79,6 +82,7 @@ class PolicySpec:
     discrete: bool
     hidden: tuple[int, ...] = (64, 64)
     action_std: float = 0.5**0.5
+    first_action: int = 0
 
     def __post_init__(self) -> None:
         for name in ("observation_dim", "action_dim"):
@@ -117,7 +121,8 @@ class PolicySpec:
             raise TypeError(
                 f"action_space must be Discrete or a Box of one dimension, got {action}"
             )
-        return cls(observation.shape[0], size, discrete, tuple(hidden), action_std)
+        first = first_action(action)
+        return cls(observation.shape[0], size, discrete, tuple(hidden), action_std, first)
 
     @property
     def refines(self) -> bool:
@@ -134,7 +139,7 @@ class PolicySpec:
         return output.log_softmax(-1)
 
     def step_scores(self, output: Tensor, action: Tensor) -> Tensor:
-        """Log-probabilities of actions, ``[...]``; see :func:`log_prob`."""
+        """Log-probabilities of actions, ``[...]``; see ``log_prob``."""
         return log_prob(self, output, action)
 
     def conservatism(self, value: float) -> float:
@@ -171,14 +176,60 @@ def build_network(spec: Spec, *, generator: torch.Generator) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
+class CategoricalFrom(Categorical):
+    """A categorical distribution over the actions of ``Discrete(n, start)``.
+
+    Args:
+        logits: ``[..., n]``.
+        first: The start.
+    """
+
+    def __init__(self, logits: Tensor, *, first: int) -> None:
+        super().__init__(logits=logits)  # type: ignore[no-untyped-call]
+        self.first = first
+
+    def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:  # type: ignore[override]
+        """Actions ``[*sample_shape, ...]``."""
+        drawn: Tensor = super().sample(torch.Size(sample_shape))  # type: ignore[no-untyped-call]
+        return self.first + drawn
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-probability of actions ``[...]``."""
+        chosen: Tensor = super().log_prob(value - self.first)  # type: ignore[no-untyped-call]
+        return chosen
+
+    @property
+    def mode(self) -> Tensor:
+        """The most likely action, ``[...]``."""
+        return self.first + self.logits.argmax(-1)
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """What TorchRL takes where it does not explore: the mode."""
+        return self.mode
+
+    def expand(self, batch_shape: Sequence[int], _instance: Any = None) -> "CategoricalFrom":
+        """The same distribution for a larger batch."""
+        logits = self.logits.expand(*batch_shape, self.logits.shape[-1])
+        return CategoricalFrom(logits, first=self.first)
+
+
 def build_actor(spec: PolicySpec, network: nn.Module) -> ProbabilisticActor:
     """Wrap a network ``[..., O] -> [..., K]`` as a TorchRL actor.
 
-    It reads ``observation`` and writes ``action``, ``[...]`` if discrete, else ``[..., A]``.
+    It reads ``observation`` and writes ``action`` as the environment takes it, ``[...]`` if
+    discrete, else ``[..., A]``.
     """
     if spec.discrete:
         module = TensorDictModule(network, in_keys=[OBSERVATION], out_keys=["logits"])
-        return ProbabilisticActor(module, in_keys=["logits"], distribution_class=Categorical)
+        if spec.first_action == 0:
+            return ProbabilisticActor(module, in_keys=["logits"], distribution_class=Categorical)
+        return ProbabilisticActor(
+            module,
+            in_keys=["logits"],
+            distribution_class=CategoricalFrom,
+            distribution_kwargs={"first": spec.first_action},
+        )
 
     class Gaussian(nn.Module):
         def __init__(self) -> None:

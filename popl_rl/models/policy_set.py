@@ -53,7 +53,8 @@ class PolicySet(HypothesisSet):
             generator: Needed to sample.
 
         Returns:
-            Actions ``[...]`` (discrete) or ``[..., A]``, with ``N`` in front if ``member`` is None.
+            Actions as the environment takes them, ``[...]`` (discrete) or ``[..., A]``, with ``N``
+            in front if ``member`` is None.
 
         Raises:
             IndexError: If there is no such member.
@@ -67,19 +68,25 @@ class PolicySet(HypothesisSet):
             if not 0 <= member < len(self):
                 raise IndexError(f"member must be in 0..{len(self) - 1}, got {member}")
             output = self.population.subset([member])(batch)[0]
-        if not self.population.spec.discrete:
+        spec = cast("PolicySpec", self.population.spec)
+        if not spec.discrete:
             action = output
         elif greedy:
-            action = output.argmax(-1)
+            action = spec.first_action + output.argmax(-1)
         elif generator is None:
             raise ValueError("generator must be given to sample actions; or pass greedy=True")
         else:
             flat = output.softmax(-1).flatten(0, -2)
-            action = torch.multinomial(flat, 1, generator=generator).view(output.shape[:-1])
-        return action.squeeze(-1 if self.population.spec.discrete else -2) if single else action
+            drawn = torch.multinomial(flat, 1, generator=generator).view(output.shape[:-1])
+            action = spec.first_action + drawn
+        return action.squeeze(-1 if spec.discrete else -2) if single else action
 
     def actor(self, member: int) -> ProbabilisticActor:
-        """One policy as a TorchRL actor, for collectors and further training."""
+        """One policy as a TorchRL actor, for collectors and further training.
+
+        Its actions are those of the environment. TorchRL's own wrappers of Gymnasium take
+        ``Discrete(n, start)`` for ``0..n - 1`` in specs and random actions.
+        """
         return build_actor(
             cast("PolicySpec", self.population.spec), self.population.network(member)
         )

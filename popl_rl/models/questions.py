@@ -152,7 +152,7 @@ def best_question(
         behaviours: What hypotheses would answer to P candidates.
         weights: Belief in each hypothesis, ``[N]``.
         open_: Whether each candidate may still be asked, bool ``[P]``.
-        rule: A name in :data:`RULES`, or ``"uniform"``.
+        rule: A name in ``RULES``, or ``"uniform"``.
         generator: Source of the draw, for ``"uniform"`` alone.
 
     Raises:

@@ -26,7 +26,7 @@ class RewardSpec:
 
     Attributes:
         observation_dim: Length O of what the network reads: an observation, with the action behind
-            it if actions are continuous (see :func:`reward_bank`).
+            it if actions are continuous (see ``reward_bank``).
         action_dim: Number K of outputs: one for each discrete action, or 1.
         hidden: Units of each hidden layer. Empty for a linear reward.
     """
@@ -94,7 +94,7 @@ class RewardSpec:
         return 1.0
 
     def bank(self, segments: TensorDictBase) -> SegmentBank:
-        """See :func:`reward_bank`."""
+        """See ``reward_bank``."""
         return reward_bank(segments)
 
 

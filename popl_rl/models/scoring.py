@@ -207,7 +207,7 @@ def margins(
         population: N members.
         bank: Segments that the comparisons refer to.
         comparisons: M comparisons.
-        alpha: Scale of the scores, as for :func:`segment_scores`.
+        alpha: Scale of the scores, as for ``segment_scores``.
         discount: Per-step discount.
 
     Returns:

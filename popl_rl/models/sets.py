@@ -13,7 +13,7 @@ __all__ = ["as_set", "load_set"]
 
 
 def as_set(population: Population, *, alpha: float, discount: float = 1.0) -> HypothesisSet:
-    """A :class:`PolicySet` of policies, or a :class:`RewardSet` of reward functions."""
+    """A ``PolicySet`` of policies, or a ``RewardSet`` of reward functions."""
     kind = PolicySet if isinstance(population.spec, PolicySpec) else RewardSet
     return kind(population, alpha=alpha, discount=discount)
 

@@ -10,6 +10,7 @@ beta-variational autoencoder, Higgins et al., 2017).
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -193,7 +194,7 @@ def save_clone(clone: StyleClone, path: Path) -> None:
 
 
 def load_clone(spec: PolicySpec, path: Path) -> StyleClone:
-    """Read what :func:`save_clone` wrote.
+    """Read what ``save_clone`` wrote.
 
     Raises:
         FileNotFoundError: If there is none.
@@ -211,7 +212,7 @@ def load_clone(spec: PolicySpec, path: Path) -> StyleClone:
 
 
 def _decoder_spec(spec: PolicySpec, code_dim: int) -> PolicySpec:
-    return PolicySpec(spec.observation_dim + code_dim, spec.action_dim, spec.discrete, spec.hidden)
+    return replace(spec, observation_dim=spec.observation_dim + code_dim)
 
 
 def _nothing() -> torch.Generator:

@@ -14,7 +14,7 @@ __all__ = ["StyledPopulation"]
 class StyledPopulation(Population):
     """Members of a few numbers each, told to a frozen network.
 
-    See :class:`~popl_rl.models.style_codes.StyleClone` for the network.
+    See ``popl_rl.models.style_codes.StyleClone`` for the network.
 
     For a fixed code the clone is an ordinary policy network: what the code adds to the first layer
     is a bias. All other weights are shared, so scoring multiplies large matrices and a member is
@@ -63,7 +63,7 @@ class StyledPopulation(Population):
         code.copy_(code.clamp(self.clone.low, self.clone.high))
 
     def with_members(self, members: TensorDictBase) -> "StyledPopulation":
-        """See :class:`~popl_rl.models.population.Population`."""
+        """See ``popl_rl.models.population.Population``."""
         return StyledPopulation(self.clone, members["code"])
 
     def network(self, index: int) -> nn.Sequential:

@@ -37,7 +37,7 @@ def scenario_dots(suite: Suite, results: pd.DataFrame) -> Figure:
 
     Args:
         suite: The suite.
-        results: Rows as of :func:`popl_rl.experiments.cells.collect`; of what methods are compared
+        results: Rows as of ``popl_rl.experiments.cells.collect``; of what methods are compared
             with, only a policy for everybody and the oracle are shown, and other ways to cater not
             at all.
 
@@ -97,7 +97,7 @@ def catering_curves(suite: Suite, results: pd.DataFrame) -> Figure:
 
     Args:
         suite: The suite.
-        results: Rows as of :func:`popl_rl.experiments.cells.collect`, with measures such as
+        results: Rows as of ``popl_rl.experiments.cells.collect``, with measures such as
             ``recovery@10`` and ``best_recovery``.
 
     Returns:
@@ -152,7 +152,7 @@ def recovery_along_axes(suite: Suite, results: pd.DataFrame) -> Figure:
 
     Args:
         suite: A suite with axes.
-        results: Rows as of :func:`popl_rl.experiments.cells.collect`.
+        results: Rows as of ``popl_rl.experiments.cells.collect``.
 
     Raises:
         ValueError: If no method has recoveries at two points of an axis.

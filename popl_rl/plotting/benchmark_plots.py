@@ -34,7 +34,7 @@ def scenario_bars(suite: Suite, results: pd.DataFrame) -> Figure:
 
     Args:
         suite: The suite.
-        results: Rows as of :func:`popl_rl.experiments.cells.collect`; scenarios and methods without
+        results: Rows as of ``popl_rl.experiments.cells.collect``; scenarios and methods without
             recoveries are left out.
 
     Returns:
@@ -102,7 +102,7 @@ def sweep_panels(suite: Suite, results: pd.DataFrame) -> Figure:
 
     Args:
         suite: A suite with axes.
-        results: Rows as of :func:`popl_rl.experiments.cells.collect`.
+        results: Rows as of ``popl_rl.experiments.cells.collect``.
 
     Returns:
         A line for each method that runs along the axis: solid for what new raters are given, with

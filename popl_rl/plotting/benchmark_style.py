@@ -72,7 +72,7 @@ def headline_name(table: pd.DataFrame) -> str:
     """Name of what an axis shows; both if scenarios differ in their headline measure.
 
     Args:
-        table: Rows as of :func:`popl_rl.evaluation.statistics.worst`.
+        table: Rows as of ``popl_rl.evaluation.statistics.worst``.
     """
     found = set(table["measure"])
     return ", or ".join(name for measure, name in HEADLINES.items() if measure in found)
@@ -82,7 +82,7 @@ def explain_headline(table: pd.DataFrame) -> str:
     """Definition of what an axis shows, for a caption.
 
     Args:
-        table: Rows as of :func:`popl_rl.evaluation.statistics.worst`.
+        table: Rows as of ``popl_rl.evaluation.statistics.worst``.
     """
     if set(table["measure"]) == {"share_of_optimum"}:
         return "Share of optimum: (return − random) / (optimum − random)"
@@ -95,7 +95,7 @@ def explain_scale(table: pd.DataFrame) -> str:
     """What 1 and 0 are, for the caption of a narrow figure.
 
     Args:
-        table: Rows as of :func:`popl_rl.evaluation.statistics.worst`.
+        table: Rows as of ``popl_rl.evaluation.statistics.worst``.
     """
     if set(table["measure"]) == {"share_of_optimum"}:
         return "Share of optimum: 1 the optimum, 0 random actions"
@@ -106,7 +106,7 @@ def ends_of_scale(table: pd.DataFrame) -> tuple[str, str]:
     """What 1 and 0 on an axis mean.
 
     Args:
-        table: Rows as of :func:`popl_rl.evaluation.statistics.worst`.
+        table: Rows as of ``popl_rl.evaluation.statistics.worst``.
     """
     if set(table["measure"]) == {"share_of_optimum"}:
         return "the optimum", "as good as\nrandom actions"

@@ -37,9 +37,9 @@ def majority_figure(
         states: Position of each state on the line, ``[S]``.
         truths: Group name -> true utility, ``[S]``.
         preferred: Share of the raters who prefer state i to state j, ``[S, S]``, from
-            :func:`~popl_rl.raters.condorcet.majority_preference`.
+            ``popl_rl.raters.condorcet.majority_preference``.
         cycle: Indices of three states of which the first beats the second, this the third, and this
-            the first; what :func:`~popl_rl.raters.condorcet.find_cycle` finds if None.
+            the first; what ``popl_rl.raters.condorcet.find_cycle`` finds if None.
 
     Returns:
         What each group wants, with the three states marked; the majorities for all pairs; and the

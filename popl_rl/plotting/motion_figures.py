@@ -43,9 +43,9 @@ def draw_motion(
     Returns:
         Nothing where the environment measures nothing.
     """
-    if not evaluator.env.measured or not isinstance(found, PolicySet):
+    if not evaluator.infos.measured or not isinstance(found, PolicySet):
         return {}
-    measure = evaluator.env.measured[0]
+    measure = evaluator.infos.measured[0]
     names = [group.name for group in evaluator.groups]
     shown = found.subset(range(min(_MOST, len(found))))
     serves = evaluator.accuracy(shown).argmax(1).tolist()
@@ -69,8 +69,8 @@ def draw_motion(
 
 def _place(episodes: TensorDictBase, evaluator: Evaluator) -> Tensor:
     """Steps to success and mean peak of what is measured, ``[P, 2]``."""
-    steps = steps_to_success(episodes, evaluator.env.success)
-    return torch.stack([steps, mean_and_peak(episodes, evaluator.env.measured[0])[1]], -1)
+    steps = steps_to_success(episodes, evaluator.infos.success)
+    return torch.stack([steps, mean_and_peak(episodes, evaluator.infos.measured[0])[1]], -1)
 
 
 def animate(

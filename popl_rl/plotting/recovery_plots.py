@@ -35,7 +35,7 @@ def recovery_bars(results: pd.DataFrame, *, floor: str = "random actions") -> Fi
 
     Args:
         results: Tidy rows ``method, choice, group, measure, value``; those of the headline measure
-            (:func:`~popl_rl.evaluation.statistics.headline_measure`) are drawn. Several rows of a
+            (``popl_rl.evaluation.statistics.headline_measure``) are drawn. Several rows of a
             method, choice and group, such as seeds, are averaged and dotted.
         floor: What a recovery of 0 is.
 

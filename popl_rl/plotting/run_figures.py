@@ -63,11 +63,22 @@ def draw(
     evaluator: Evaluator,
     world: World,
     reward_baselines: RewardBaselines | None = None,
+    with_animations: bool = False,
 ) -> dict[str, Path]:
     """Draw every picture that the run has the data for, into ``run_dir/figures``.
 
     The occupancy map needs an environment with ``cells`` (column and row of every state) and
     ``("info", "state")``.
+
+    Args:
+        run_dir: Folder of the run, with ``metrics.csv`` and maybe ``history.csv``.
+        found: The set.
+        baselines: Pooled CPL, then the oracle of each group; None without.
+        board: What came out.
+        evaluator: What evaluated it.
+        world: Where policies act.
+        reward_baselines: B-REX and DPL, where items are judged.
+        with_animations: Whether to record a GIF for each group, where there is a renderer.
 
     Returns:
         Name and file of each picture.
@@ -82,7 +93,7 @@ def draw(
     table = board.results
     measured = (table.measure == headline_measure(table)) & ~table.method.isin(["oracle", "random"])
     if table.value[measured].notna().any():
-        floor = _FLOORS[evaluator.config.reference]
+        floor = _FLOORS[evaluator.protocol.reference]
         figures["recovery"] = recovery_bars(table, floor=floor)
     history = run_dir / "history.csv"
     if history.exists() and len(evaluator.groups) > 1:
@@ -99,7 +110,7 @@ def draw(
     for name, figure in figures.items():
         paths[name] = folder / f"{name}.png"
         save(figure, paths[name])
-    if evaluator.config.animate:
+    if with_animations:
         try:
             paths |= animate(folder, found, board=board, world=world, seed=evaluator.seed)
         except RuntimeError as error:

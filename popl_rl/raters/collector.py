@@ -21,12 +21,11 @@ __all__ = ["PreferenceCollector", "check_preferences", "collect_preferences", "l
 class PreferenceCollector(Transform):
     """Has raters compare pairs of stored segments, as queries are written to a replay buffer.
 
-    Append it to the buffer that keeps preferences and extend that buffer with queries: a
-    TensorDict ``[M]`` with ``rater`` (whom to ask) and, if you choose the queries yourself,
-    ``pair``. Pairs that are not given are drawn uniformly from the stored segments: where these say
-    which state they go on from (:data:`~popl_rl.keys.START`), from those of one state. What is
-    written is the query with ``answer`` and, for evaluation only, ``("hidden", "group")`` and
-    ``("hidden", "utility")``.
+    Append it to the buffer that keeps preferences and extend that buffer with queries: a TensorDict
+    ``[M]`` with ``rater`` (whom to ask) and, if you choose the queries yourself, ``pair``. Pairs
+    that are not given are drawn uniformly from the stored segments: where these say which state
+    they go on from (``popl_rl.keys.START``), from those of one state. What is written is the query
+    with ``answer`` and, for evaluation only, ``("hidden", "group")`` and ``("hidden", "utility")``.
 
     Args:
         segments: Replay buffer of segments, one item each.
@@ -107,7 +106,7 @@ def collect_preferences(
         raters: Who is asked.
         answers_per_rater: Pairs that each rater is shown.
         generator: Source of the pairs and of the raters' randomness.
-        pool: What pairs are drawn from, see :class:`PreferenceCollector`.
+        pool: What pairs are drawn from, see ``PreferenceCollector``.
 
     Returns:
         Replay buffer of ``len(raters) * answers_per_rater`` preferences.

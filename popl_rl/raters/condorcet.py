@@ -68,8 +68,8 @@ def find_cycle(preferred: Tensor, *, threshold: float = 0.5) -> list[int] | None
 
     Args:
         preferred: Share of the raters who prefer thing i to thing j, ``[N, N]``, from
-            :func:`majority_preference`. Memory and time grow with N³; up to 200 things are a
-            matter of a second.
+            ``majority_preference``. Memory and time grow with N³; up to 200 things are a matter of
+            a second.
         threshold: Share that must be exceeded to beat another thing, at least 0.5.
 
     Returns:

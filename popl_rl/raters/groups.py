@@ -38,8 +38,8 @@ class RaterGroup:
             environment has a transition table.
         first_action: The action of the first column of ``advantages``.
         value: What a state is worth, observations ``[..., O]`` -> ``[...]``, for label="regret"
-            elsewhere; see :func:`popl_rl.raters.values.with_values`.
-            None for "return", as ``advantages``.
+            elsewhere; see ``popl_rl.raters.values.with_values``. None for "return", as
+            ``advantages``.
 
     Raises:
         ValueError: If ``label`` is neither, or ``advantages`` and ``value`` do not go with it.
@@ -94,9 +94,9 @@ class RaterGroup:
         sum ``sum u + V(s_T) - V(s_0)``.
 
         Raises:
-            ValueError: As :meth:`step_utility`, or if segments do not say which state each step was
+            ValueError: As ``step_utility``, or if segments do not say which state each step was
                 taken in.
-            TypeError: As :meth:`step_utility`.
+            TypeError: As ``step_utility``.
         """
         if self.value is not None:
             segment_utility = self.value(segments[OBSERVATION])
@@ -129,8 +129,8 @@ class RaterGroup:
         """Return each segment's worth to this group, float32 ``[N]``: the myopic sum of its steps.
 
         Raises:
-            ValueError: As :meth:`perceived_utility`.
-            TypeError: As :meth:`perceived_utility`.
+            ValueError: As ``perceived_utility``.
+            TypeError: As ``perceived_utility``.
         """
         # Summed in float64: two segments with the same steps in another order must come out equal.
         steps = self.perceived_utility(segments).double()
@@ -151,10 +151,9 @@ def make_groups(
     """Make rater groups from references or functions.
 
     Args:
-        references: One per group: a reference (see :mod:`popl_rl.registry`) or the function itself.
-            A group is called by what follows ':', by its registered name, or by the function's
-            name.
-        label: What groups compare, "regret" or "return"; see :class:`RaterGroup`.
+        references: One per group: a reference (see ``popl_rl.registry``) or the function itself. A
+            group is called by what follows ':', by its registered name, or by the function's name.
+        label: What groups compare, "regret" or "return"; see ``RaterGroup``.
         table: The environment's transitions, needed for "regret".
         response: How people answer: one for all groups, or one per group. None always answers
             rightly.
@@ -164,8 +163,8 @@ def make_groups(
     Raises:
         ValueError: If there are no references, one cannot be resolved, two groups would have the
             same name, label="regret" comes without a table, or the number of responses differs; and
-            as :meth:`RaterGroup.step_utility`.
-        TypeError: If ``references`` is a single string, or as :meth:`RaterGroup.step_utility`.
+            as ``RaterGroup.step_utility``.
+        TypeError: If ``references`` is a single string, or as ``RaterGroup.step_utility``.
     """
     if isinstance(references, str):
         raise TypeError(

@@ -43,7 +43,7 @@ class PairPool:
         """Uniform pairs of two different segments, ``[num_pairs, 2]``; some may be drawn twice.
 
         Raises:
-            ValueError: If (nearly) all pairs were asked already, and as :func:`draw_pairs`.
+            ValueError: If (nearly) all pairs were asked already, and as ``draw_pairs``.
         """
         pairs = self._draw(num_pairs, generator)
         if self.asked is None:
@@ -60,6 +60,22 @@ class PairPool:
             "more segments (data.segments), or ask about fewer pairs (raters.count, "
             "raters.answers)"
         )
+
+    @property
+    def num_pairs(self) -> int:
+        """Different pairs that can be drawn."""
+        start = torch.zeros(self.num_segments) if self.start is None else self.start
+        start = start if self.allowed is None else start[self.allowed]
+        each = start.unique(return_counts=True)[1]
+        found = int((each * (each - 1) // 2).sum())
+        if self.asked is None:
+            return found
+        asked = self.asked
+        if self.start is not None:
+            asked = asked[self.start[asked[:, 0]] == self.start[asked[:, 1]]]
+        if self.allowed is not None:
+            asked = asked[torch.isin(asked, self.allowed).all(1)]
+        return found - len(self._code(asked).unique())
 
     def _size(self) -> int:
         return self.num_segments if self.allowed is None else len(self.allowed)
@@ -94,8 +110,8 @@ def training_pool(segments: TensorDictBase) -> PairPool:
 def held_out_pool(segments: TensorDictBase, asked: Tensor) -> PairPool:
     """Pairs to evaluate on, none of which was asked in training.
 
-    Where segments say which state they go on from, all pairs of the starts that
-    :func:`training_pool` leaves out, so that not even a segment was shown. ``asked`` matters there
+    Where segments say which state they go on from, all pairs of the starts that ``training_pool``
+    leaves out, so that not even a segment was shown. ``asked`` matters there
     too: loaded preferences may be about any segments.
 
     Args:

@@ -97,8 +97,8 @@ class Raters:
         """Return what each segment is worth to each group, float32 ``[G, N]``.
 
         Raises:
-            ValueError: As :meth:`RaterGroup.perceived_utility`.
-            TypeError: As :meth:`RaterGroup.perceived_utility`.
+            ValueError: As ``RaterGroup.perceived_utility``.
+            TypeError: As ``RaterGroup.perceived_utility``.
         """
         return torch.stack([group.segment_utility(segments) for group in self.groups])
 
@@ -111,11 +111,11 @@ class Raters:
             pairs: ``[M, 2]`` int64, rows of the two segments.
             rater: ``[M]`` int64, who is asked.
             segment_utility: ``[G, N]`` float, what each segment is worth to each group, from
-                :meth:`segment_utility`.
+                ``segment_utility``.
             generator: Source of randomness, on the device of ``segment_utility``.
 
         Returns:
-            ``[M]`` int64, each an :class:`~popl_rl.keys.Answer`.
+            ``[M]`` int64, each an ``popl_rl.keys.Answer``.
 
         Raises:
             ValueError: If shapes do not fit together.

@@ -72,7 +72,7 @@ class Response:
             generator: Source of randomness, on the device of ``sums``.
 
         Returns:
-            ``[M]`` int64, each an :class:`~popl_rl.keys.Answer`.
+            ``[M]`` int64, each an ``popl_rl.keys.Answer``.
 
         Raises:
             ValueError: If ``sums`` is of another shape or not finite.

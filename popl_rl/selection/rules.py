@@ -194,7 +194,7 @@ def selection_rule(name: str, *, tournament: int = 4) -> Selection | None:
     """Rule of a name; None stands for lexicase selection.
 
     Args:
-        name: ``"lexicase"`` or a key of :data:`SELECTIONS`.
+        name: ``"lexicase"`` or a key of ``SELECTIONS``.
         tournament: Members in a tournament.
 
     Raises:

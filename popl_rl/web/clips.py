@@ -95,7 +95,7 @@ def write_clip(clip: Clip, folder: Path, index: int) -> None:
 
 
 def read_clip(folder: Path, index: int) -> Clip | None:
-    """What :func:`write_clip` wrote; None if it did not, or was interrupted."""
+    """What ``write_clip`` wrote; None if it did not, or was interrupted."""
     about = folder / f"{index}.json"
     if not about.is_file():
         return None

@@ -67,7 +67,7 @@ class Database:
             self._connection.execute("COMMIT")
 
     def run(self, statement: str, values: Sequence[Any] = ()) -> int:
-        """Run a statement inside of :meth:`writing`; returns the number of the row it made."""
+        """Run a statement inside of ``writing``; returns the number of the row it made."""
         with self.lock:
             return int(self._connection.execute(statement, values).lastrowid or 0)
 

@@ -176,7 +176,7 @@ class Guards:
 def guards(
     *, hosts: tuple[str, ...] | None, key: str | None, rate: float, newcomers: int
 ) -> Middleware:
-    """The checks of every request, see :class:`Guards`.
+    """The checks of every request, see ``Guards``.
 
     Args:
         hosts: Names that the server may be asked for by; None for any.

@@ -74,7 +74,7 @@ class Given:
         rater: Number of the rater.
         first: Segment on the left.
         second: Segment on the right.
-        answer: An :class:`~popl_rl.keys.Answer`.
+        answer: An ``popl_rl.keys.Answer``.
     """
 
     rater: int
@@ -177,7 +177,7 @@ class LabelStore:
         Args:
             rater: Who answers.
             position: Which of the rater's questions.
-            answer: An :class:`~popl_rl.keys.Answer`.
+            answer: An ``popl_rl.keys.Answer``.
             seconds: How long it took, as the page says.
 
         Returns:

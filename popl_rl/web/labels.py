@@ -34,7 +34,7 @@ def choose_pairs(
     """Different pairs of segments for people to compare.
 
     Where segments go on from common states, only those from which people are asked for training are
-    used (:func:`~popl_rl.raters.pairs.training_pool`).
+    used (``popl_rl.raters.pairs.training_pool``).
 
     Args:
         segments: TensorDict ``[N, T]``.

@@ -165,7 +165,7 @@ async def form(request: Request) -> Mapping[str, str]:
 
 
 def answer_of(value: object) -> int:
-    """The :class:`~popl_rl.keys.Answer` that is called ``first``, ``second``, ``tie`` or ``skip``.
+    """The ``popl_rl.keys.Answer`` that is called ``first``, ``second``, ``tie`` or ``skip``.
 
     Raises:
         HTTPException: With 400, if it is something else.

@@ -41,7 +41,7 @@ class Asked:
         first: Segment on the left.
         second: Segment on the right.
         further: Whether it was asked after a policy had been served.
-        answer: An :class:`~popl_rl.keys.Answer`; None if it is open.
+        answer: An ``popl_rl.keys.Answer``; None if it is open.
     """
 
     position: int

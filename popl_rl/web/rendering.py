@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from popl_rl.data.environments import World, counting_from_zero
+from popl_rl.data.environments import World
 from popl_rl.keys import ACTION, OBSERVATION
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.sets import load_set
@@ -173,7 +173,7 @@ def _render_policies(scenes: Scenes, members: list[int]) -> None:
     torch.set_num_threads(1)
     policies = load_set(scenes.source)
     assert isinstance(policies, PolicySet)
-    env: Any = counting_from_zero(scenes.make_world().make())
+    env: Any = scenes.make_world().make()
     env.unwrapped.render_mode = "rgb_array"
     rate = float(env.metadata.get("render_fps", _RATE))
     films = {}

@@ -10,7 +10,7 @@
 ``POST /verdict``     keeps whether it ``suits``: ``yes`` or ``no``
 ``GET /further``      random pairs, which tell whether it really does
 ``GET /researcher``   with ``?pass=``: who was served what; ``/researcher.csv`` and ``.json``
-``/api/...``          the same for programs, see :mod:`popl_rl.web.serve_api`
+``/api/...``          the same for programs, see ``popl_rl.web.serve_api``
 ====================  ==========================================================================
 """
 

@@ -16,7 +16,7 @@ def phrases(language: str) -> Mapping[str, str]:
     """Phrases by name; those that a language lacks are English.
 
     Args:
-        language: A code in :data:`LANGUAGES`.
+        language: A code in ``LANGUAGES``.
 
     Raises:
         ValueError: If there is no such language.

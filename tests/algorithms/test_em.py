@@ -168,27 +168,3 @@ def test_two_obvious_groups_are_found(bank, comparisons):
     assert float(right.max()) > 0.85
     assert metrics[-1]["log_likelihood"] > metrics[0]["log_likelihood"]
     assert metrics[-1]["smallest_share"] == pytest.approx(0.5, abs=0.05)
-
-
-def test_the_seed_decides_everything(bank, comparisons):
-    def run(seed):
-        popl = build(bank, comparisons, seed=seed)
-        return [popl.step() for _ in range(3)], tensors(popl)
-
-    metrics, found = run(0)
-    again, same = run(0)
-    assert again == metrics
-    assert all(map(torch.equal, found, same))
-    assert not any(map(torch.equal, found, run(1)[1]))
-
-
-def test_continuing_is_as_never_having_stopped(bank, comparisons):
-    straight = build(bank, comparisons)
-    straight.step()
-    state = straight.state_dict()
-    expected = [straight.step() for _ in range(3)]
-    resumed = build(bank, comparisons, seed=5)
-    resumed.load_state_dict(state)
-    assert [resumed.step() for _ in range(3)] == expected
-    assert all(map(torch.equal, tensors(straight), tensors(resumed)))
-    assert straight.result().origin == resumed.result().origin

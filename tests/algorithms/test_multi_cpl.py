@@ -67,30 +67,6 @@ def test_pooled_policies_are_better_than_chance_for_everybody_together(bank, com
     assert metrics[-1]["mean_accuracy"] < learnt[-1]["mean_accuracy"] - 0.1
 
 
-def test_the_seed_decides_everything(bank, comparisons):
-    def run(seed):
-        popl = build(bank, comparisons, seed=seed)
-        return [popl.step() for _ in range(3)], parameters_of(popl)
-
-    metrics, parameters = run(0)
-    again, same = run(0)
-    assert again == metrics
-    assert all(map(torch.equal, parameters, same))
-    assert not any(map(torch.equal, parameters, run(1)[1]))
-
-
-def test_continuing_is_as_never_having_stopped(bank, comparisons):
-    straight = build(bank, comparisons)
-    straight.step()
-    state = straight.state_dict()
-    expected = [straight.step() for _ in range(3)]
-    resumed = build(bank, comparisons, seed=5)
-    resumed.load_state_dict(state)
-    assert resumed.generation == 1
-    assert [resumed.step() for _ in range(3)] == expected
-    assert all(map(torch.equal, parameters_of(straight), parameters_of(resumed)))
-
-
 def test_the_set_is_everybody_who_differs(bank, comparisons):
     popl = build(bank, comparisons)
     popl.step()

@@ -11,10 +11,9 @@ from popl_rl.algorithms.variation import GaussianHead, GradientCPL
 from popl_rl.config import DataConfig, EnvConfig, MethodConfig, RatersConfig, Training
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
-from popl_rl.data.environments import build_world
 from popl_rl.evaluation.measures import group_accuracy, held_out_pairs
 from popl_rl.experiments.builders import build_method, build_problem
-from popl_rl.experiments.data import build_groups, make_data
+from popl_rl.experiments.data import build_groups, build_world, make_data
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.population import Population
 from popl_rl.models.scoring import case_values, margins, rater_accuracy, segment_scores

@@ -214,18 +214,6 @@ def test_a_saved_set_keeps_its_encoder(trained, tmp_path, bank, preferences):
         PolicySet.load(tmp_path / "policies")
 
 
-def test_the_seed_decides_everything(bank, comparisons):
-    def run(seed):
-        popl = build(bank, comparisons, seed=seed)
-        return [popl.step() for _ in range(3)], tensors(popl)
-
-    metrics, found = run(0)
-    again, same = run(0)
-    assert again == metrics
-    assert all(map(torch.equal, found, same))
-    assert not any(map(torch.equal, found, run(1)[1]))
-
-
 def test_looking_at_the_population_changes_nothing(bank, comparisons):
     """Snapshots for pictures do, as often as somebody wants."""
     one, other = build(bank, comparisons), build(bank, comparisons)
@@ -234,18 +222,6 @@ def test_looking_at_the_population_changes_nothing(bank, comparisons):
     assert len(one.population) == 8
     one.result()
     assert one.step() == other.step()
-
-
-def test_continuing_is_as_never_having_stopped(bank, comparisons):
-    straight = build(bank, comparisons)
-    straight.step()
-    state = straight.state_dict()
-    expected = [straight.step() for _ in range(3)]
-    resumed = build(bank, comparisons, seed=5)
-    resumed.load_state_dict(state)
-    assert resumed.generation == 1
-    assert [resumed.step() for _ in range(3)] == expected
-    assert all(map(torch.equal, tensors(straight), tensors(resumed)))
 
 
 def test_what_it_cannot_do_is_said(bank, comparisons):

@@ -69,6 +69,7 @@ def test_a_run_from_segments_to_animations(config_of, tmp_path, monkeypatch):
         "env.max_steps=90",
         f"data.store={tmp_path / 'store'}",
         "data.segments=24",
+        "evaluation.pairs=12",
         "data.length=20",
         "raters.count=8",
         "raters.answers=5",

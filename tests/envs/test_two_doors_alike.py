@@ -2,9 +2,8 @@ import pytest
 import torch
 
 from popl_rl.config import DataConfig, EnvConfig
-from popl_rl.data.environments import build_world
 from popl_rl.envs import two_doors_alike
-from popl_rl.experiments.data import fresh_segments
+from popl_rl.experiments.data import build_world, fresh_segments
 from popl_rl.raters.groups import make_groups
 
 ENV = EnvConfig(data_options={"start": "mixed"}, mixture={"planner/*": 0.5, "explorer": 0.5})

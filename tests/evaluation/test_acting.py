@@ -3,16 +3,14 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from popl_rl.config import EnvConfig, EvaluationConfig
-from popl_rl.data.environments import build_world
+from popl_rl.data.environments import make_world
 from popl_rl.data.rollouts import MASK
 from popl_rl.evaluation.acting import Choosing, Optimising, Planning, Rolling, plan
 from popl_rl.models.population import Population
 from popl_rl.models.reward_functions import RewardSpec, reward_bank
 from popl_rl.models.reward_set import RewardSet
 
-ENV = EnvConfig(factory="popl_rl.testing:tiny_env", options={"max_steps": 8}, max_steps=8)
-CONFIG = EvaluationConfig(episodes=10, ppo_frames=8192, menu=4)
+HOW = {"episodes": 10, "max_steps": 8, "seed": 0}
 
 
 def rewards(*rows):
@@ -31,7 +29,7 @@ RIGHT = [[0, 0, 0, 0, 0], [1, 1, 1, 1, 1]]
 
 @pytest.fixture(scope="module")
 def world():
-    return build_world(ENV)
+    return make_world("popl_rl.testing:tiny_env", options={"max_steps": 8})
 
 
 def test_planning_takes_the_best_action_everywhere(world):
@@ -54,7 +52,7 @@ def test_the_scale_of_a_reward_changes_nothing(world):
 
 
 def test_planned_rewards_act(world):
-    acting = Planning(world, ENV, CONFIG, seed=0)
+    acting = Planning(world, **HOW)
     episodes = acting(rewards(LEFT, RIGHT))
     assert episodes.shape == (2, 10, 8)
     assert (episodes["action"][0][episodes[MASK][0]] == 0).all()
@@ -63,14 +61,14 @@ def test_planned_rewards_act(world):
 
 
 def test_planning_needs_a_table(world):
-    blind = build_world(EnvConfig(factory="gymnasium:make", id="CartPole-v1"))
+    blind = make_world("gymnasium:make", env_id="CartPole-v1")
     with pytest.raises(ValueError, match="no transition table to plan with; set evaluation"):
-        Planning(blind, ENV, CONFIG, seed=0)(rewards(LEFT))
+        Planning(blind, **HOW)(rewards(LEFT))
 
 
 def test_reward_functions_do_not_roll_by_themselves(world):
     with pytest.raises(TypeError, match="hypotheses must be a PolicySet, got a RewardSet"):
-        Rolling(world, ENV, CONFIG, seed=0)(rewards(LEFT))
+        Rolling(world, **HOW)(rewards(LEFT))
 
 
 def test_ppo_finds_what_planning_finds_and_trains_each_reward_once(world):
@@ -79,7 +77,7 @@ def test_ppo_finds_what_planning_finds_and_trains_each_reward_once(world):
         {"observation": torch.eye(5).unsqueeze(1), "action": torch.zeros(5, 1).long()}, [5, 1]
     )
     bank = reward_bank(cells)
-    acting = Optimising(world, ENV, CONFIG, seed=0, bank=bank, progress=trained.append)
+    acting = Optimising(world, **HOW, frames=8192, bank=bank, progress=trained.append)
     episodes = acting(rewards(LEFT, RIGHT, LEFT))
     taken = [float(e["action"][e[MASK]].float().mean()) for e in episodes]
     assert taken[0] < 0.2
@@ -106,7 +104,7 @@ def scalar(weight):
 
 
 def test_the_best_item_of_each_menu_is_chosen(items):
-    choosing = Choosing(items, reward_bank(items), CONFIG, seed=0)
+    choosing = Choosing(items, reward_bank(items), menus=10, items=4, seed=0)
     assert choosing.menus.shape == (10, 4)
     both = RewardSet(Population([scalar(1.0), scalar(-1.0)], RewardSpec(1, 1, ())))
     episodes = choosing(both)

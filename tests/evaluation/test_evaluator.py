@@ -1,29 +1,24 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import nn
 
-from popl_rl.config import EnvConfig, EvaluationConfig, RatersConfig
-from popl_rl.data.environments import build_world
+from popl_rl.data.environments import make_world
 from popl_rl.evaluation.acting import Rolling
 from popl_rl.evaluation.diagnostics import alarm
 from popl_rl.evaluation.evaluator import Evaluator
 from popl_rl.evaluation.measures import group_returns
+from popl_rl.evaluation.protocol import EvaluationProtocol, MeasuredInfos
 from popl_rl.evaluation.statistics import RESULT_COLUMNS, rows_of
-from popl_rl.experiments.data import build_groups
 from popl_rl.models.hypothesis_set import Catered
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.population import Population
+from popl_rl.raters.groups import make_groups
 
-ENV = EnvConfig(
-    factory="popl_rl.testing:tiny_env",
-    options={"max_steps": 8},
-    max_steps=8,
-    success="next_state",
-    door="next_state",
-)
+INFOS = MeasuredInfos(success="next_state", door="next_state")
 MEASURES = {"return", "recovery", "success", "accuracy", "best_accuracy"}
 
 
@@ -41,13 +36,13 @@ def walkers(*pulls):
 
 @pytest.fixture
 def evaluator(segments, bank):
-    world = build_world(ENV)
+    world = make_world("popl_rl.testing:tiny_env", options={"max_steps": 8})
     names = ["popl_rl.testing:likes_left", "popl_rl.testing:likes_right"]
-    groups = build_groups(RatersConfig(groups=names, label="regret"), world)
+    groups = make_groups(names, label="regret", table=world.table)
     segment_utility = torch.stack([group.segment_utility(segments) for group in groups])
-    config = EvaluationConfig(episodes=6, new_raters=4, answers=10, curve=[], pairs=200)
-    acting = Rolling(world, ENV, config, seed=0)
-    return Evaluator(acting, ENV, config, groups, bank, segment_utility, seed=0)
+    protocol = EvaluationProtocol(new_raters=4, answers=10, pairs=200)
+    acting = Rolling(world, episodes=6, max_steps=8, seed=0)
+    return Evaluator(acting, groups, bank, segment_utility, protocol=protocol, infos=INFOS, seed=0)
 
 
 @pytest.fixture
@@ -186,12 +181,15 @@ def test_a_snapshot_is_the_accuracy_by_name(evaluator, policies):
 @pytest.fixture
 def curious(evaluator):
     """A judge who measures curves, of policies that always do the same."""
-    config = EvaluationConfig(
-        episodes=6, new_raters=4, answers=10, curve=[10, 1, 25], pairs=200, greedy=True
-    )
-    acting = Rolling(evaluator.acting.world, ENV, config, seed=0)
+    acting = Rolling(evaluator.acting.world, episodes=6, max_steps=8, greedy=True, seed=0)
     return Evaluator(
-        acting, ENV, config, evaluator.groups, evaluator.bank, evaluator.segment_utility, seed=0
+        acting,
+        evaluator.groups,
+        evaluator.bank,
+        evaluator.segment_utility,
+        protocol=replace(evaluator.protocol, curve=[10, 1, 25]),
+        infos=INFOS,
+        seed=0,
     )
 
 
@@ -257,7 +255,8 @@ def test_members_are_rolled_once_and_no_more_than_allowed(curious, baselines, mo
         return acting(hypotheses)
 
     monkeypatch.setattr(curious, "acting", watch)
-    curious.config.curve_members = always + 1
+    protocol = replace(curious.protocol, curve_members=always + 1)
+    monkeypatch.setattr(curious, "protocol", protocol)
     board = curious.score(policies, baselines)
     assert rolled == [0, 3, always + 1], "random actions, baselines, and the set, each in one go"
     found = values(board, "popl", "likes_left", "posterior")
@@ -338,11 +337,11 @@ def test_the_fair_choice_is_measured_on_others_than_chose_it(evaluator, policies
 def test_panels_have_the_shares_of_the_groups(evaluator):
     skewed = Evaluator(
         evaluator.acting,
-        ENV,
-        evaluator.config,
         evaluator.groups,
         evaluator.bank,
         evaluator.segment_utility,
+        protocol=evaluator.protocol,
+        infos=INFOS,
         shares=[1.0, 0.0],
         seed=0,
     )

@@ -6,15 +6,13 @@ import pytest
 import torch
 from torch import nn
 
-from popl_rl.config import EnvConfig, RatersConfig
-from popl_rl.data.environments import build_world
+from popl_rl.data.environments import make_world
 from popl_rl.evaluation.measures import group_returns, roll_out
 from popl_rl.evaluation.optimum import ExactReturns, action_probabilities, optimal_return
-from popl_rl.experiments.data import build_groups
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.population import Population
-from popl_rl.raters.groups import RaterGroup
+from popl_rl.raters.groups import RaterGroup, make_groups
 from popl_rl.raters.response import Response
 
 HORIZON = 3
@@ -36,14 +34,13 @@ def walkers(*pulls):
 
 @pytest.fixture
 def world():
-    options = {"max_steps": HORIZON}
-    return build_world(EnvConfig(factory="popl_rl.testing:tiny_env", options=options))
+    return make_world("popl_rl.testing:tiny_env", options={"max_steps": HORIZON})
 
 
 @pytest.fixture
 def groups(world):
     names = ["popl_rl.testing:likes_left", "popl_rl.testing:likes_right"]
-    return build_groups(RatersConfig(groups=names), world)
+    return make_groups(names, label="regret", table=world.table)
 
 
 @pytest.fixture

@@ -5,41 +5,15 @@ import torch
 
 from popl_rl.algorithms.cpl import GroupCPL
 from popl_rl.algorithms.variation import GaussianHead, GradientCPL
-from popl_rl.config import (
-    DataConfig,
-    EnvConfig,
-    RatersConfig,
-)
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
-from popl_rl.data.environments import build_world
-from popl_rl.experiments.data import build_groups, make_data
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.randomness import stream
 
-TINY = EnvConfig(factory="popl_rl.testing:tiny_env", options={"max_steps": 8})
-LEFT_RIGHT = ["popl_rl.testing:likes_left", "popl_rl.testing:likes_right"]
-RATERS = RatersConfig(groups=LEFT_RIGHT, count=6, answers=10)
-
 
 @pytest.fixture
-def world():
-    return build_world(TINY)
-
-
-@pytest.fixture
-def tiny_groups(world):
-    return build_groups(RATERS, world)
-
-
-def collect(world, groups, *, seed=0, load=None, segments=30, **arguments):
-    data = DataConfig(segments=segments, length=4, **arguments)
-    return make_data(data, RATERS, world, groups, seed=seed, env=EnvConfig(max_steps=8), load=load)
-
-
-@pytest.fixture
-def learning(world, tiny_groups):
+def learning(world, tiny_groups, collect):
     data = collect(world, tiny_groups)
     bank = SegmentBank.from_segments(data.steps)
     comparisons = Comparisons.from_preferences(data.preferences, cases="rater")
@@ -144,7 +118,7 @@ def test_em_is_told_how_many_groups_there_are_unless_it_is_told_otherwise(learne
 
 def test_a_method_that_takes_other_arguments_is_refused_by_name(learner, learning):
     with pytest.raises(TypeError, match=r"method 'popl': .*MultiCPL was called with problem"):
-        built(learner, learning, factory="popl_rl.algorithms.multi_cpl:MultiCPL")
+        built(learner, learning, **{**METHODS["cpl"], "reads": ["training", "vpl"]})
     with pytest.raises(ValueError, match="unknown method 'nonsense'"):
         built(learner, learning, factory="nonsense")
 

@@ -14,9 +14,8 @@ from popl_rl.config import (
     MethodConfig,
     RatersConfig,
 )
-from popl_rl.data.environments import build_world
 from popl_rl.experiments.builders import build_spec
-from popl_rl.experiments.data import build_groups, make_data
+from popl_rl.experiments.data import build_groups, build_world, make_data
 from popl_rl.experiments.evaluators import make_evaluator
 from popl_rl.keys import GROUP, PAIR
 from popl_rl.storage import save_tensordict
@@ -72,6 +71,16 @@ def unordered(pairs):
     return {frozenset(pair) for pair in pairs.tolist()}
 
 
+def test_more_held_out_pairs_than_there_are_is_said(world, groups):
+    """Of 20 segments 190 pairs, less the 12 raters' 20 answers, which are at least 100 of them."""
+    few = dataclasses.replace(DATA, segments=20)
+    data = make_data(few, RATERS, world, groups, seed=0, env=ENV)
+    asked = len(unordered(data.preferences[PAIR]))
+    said = f"asks for 500 held-out pairs, but the data have {190 - asked}: pairs repeat"
+    with pytest.warns(UserWarning, match=said):
+        evaluator_of(world, groups, data)
+
+
 def test_no_pair_of_training_is_asked_again(world, groups):
     data = make_data(DATA, RATERS, world, groups, seed=0, env=ENV)
     again = asked_in_evaluation(evaluator_of(world, groups, data))
@@ -83,7 +92,10 @@ def test_no_segment_of_training_is_shown_again_where_segments_have_starts(world,
     world = with_starts(world, walks)
     data = make_data(DATA, RATERS, world, groups, seed=0, env=ENV)
     asked = data.preferences[PAIR]
-    again = asked_in_evaluation(evaluator_of(world, groups, data))
+    # Of the four starts that are kept, six pairs each.
+    with pytest.warns(UserWarning, match="but the data have 24: pairs repeat"):
+        evaluator = evaluator_of(world, groups, data)
+    again = asked_in_evaluation(evaluator)
     assert torch.equal(again[:, 0] // 4, again[:, 1] // 4)
     # 240 queries find all 96 pairs of the 16 starts that there are for training.
     assert set((asked // 4).flatten().tolist()) == set(range(16))

@@ -1,14 +1,20 @@
 """Environments whose actions do not begin with 0, and raters of float64, from data to results."""
 
+from dataclasses import replace
+
 import gymnasium
 import pandas as pd
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import ExplorationType, GymWrapper, set_exploration_type
 
-from popl_rl.config import EnvConfig
 from popl_rl.data.behaviours import random_behaviour, table_behaviour
-from popl_rl.data.environments import build_world, counting_from_zero, indexed
+from popl_rl.data.environments import counting_from_zero, indexed, make_world
+from popl_rl.evaluation.measures import roll_out
+from popl_rl.models.policies import PolicySpec
+from popl_rl.models.policy_set import PolicySet
+from popl_rl.models.population import Population
 from popl_rl.storage import load_tensordict
 from popl_rl.testing import check_env, tiny_env
 from popl_rl.trainers import train_popl
@@ -100,7 +106,7 @@ def test_learners_count_actions_from_0(segments):
 
 
 def test_an_environment_that_counts_from_0(source):
-    world = build_world(EnvConfig(factory=f"{source}:Walk", options={"first": 1}))
+    world = make_world(f"{source}:Walk", options={"first": 1})
     env = counting_from_zero(world.make())
     assert env.action_space == gymnasium.spaces.Discrete(2)
     env.reset(seed=0)
@@ -120,6 +126,32 @@ def test_where_actions_begin_changes_no_result(results, overrides, tmp_path):
     pd.testing.assert_frame_equal(one, other, check_exact=True)
     kept = load_tensordict(tmp_path / "one" / "data" / "segments")
     assert kept["action"].unique().tolist() == [1, 2]
+
+
+@pytest.mark.parametrize("first", [0, 3])
+def test_a_set_and_its_actors_act_in_the_environment(source, first, generator):
+    """Each step asserts that its action is one of the environment's."""
+    world = make_world(f"{source}:Walk", options={"first": first})
+    spec = PolicySpec.from_env(world.env, hidden=(4,))
+    assert spec.first_action == first
+    policies = PolicySet(Population.create(spec, 2, generator=generator))
+    env = world.make()
+    observation, _ = env.reset(seed=0)
+    seen = set()
+    for _ in range(8):
+        action = policies.act(torch.from_numpy(observation), member=0, generator=generator)
+        observation = env.step(int(action))[0]
+        seen.add(int(action))
+    assert seen == {first, first + 1}
+    with torch.random.fork_rng(), set_exploration_type(ExplorationType.RANDOM):
+        torch.manual_seed(0)
+        wrapped = GymWrapper(world.make(), categorical_action_encoding=True)
+        steps = wrapped.rollout(8, policies.actor(1))
+    assert steps["action"].unique().tolist() == [first, first + 1]
+    old = PolicySet(Population.create(replace(spec, first_action=0), 2, generator=generator))
+    for found in (policies, old):  # one of the time before sets knew their environment's actions
+        rolled = roll_out(world.make, found, episodes=4, max_steps=8, seed=0)
+        assert rolled["action"].unique().tolist() == [first, first + 1]
 
 
 def test_the_checks_accept_it(source):

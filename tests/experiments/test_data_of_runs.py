@@ -9,33 +9,14 @@ from popl_rl.config import (
     RatersConfig,
     ResponseConfig,
 )
-from popl_rl.data.environments import behaviour_shares, build_world
+from popl_rl.data.environments import behaviour_shares
 from popl_rl.data.segments import collect_segments
-from popl_rl.experiments.data import build_groups, make_data
+from popl_rl.experiments.data import build_groups, build_world, make_data
 from popl_rl.keys import ANSWER, GROUP, PAIR, RATER, UTILITY
 from popl_rl.models.policies import PolicySpec
 from popl_rl.randomness import stream
 from popl_rl.raters.groups import make_groups
 from popl_rl.storage import save_tensordict
-
-TINY = EnvConfig(factory="popl_rl.testing:tiny_env", options={"max_steps": 8})
-LEFT_RIGHT = ["popl_rl.testing:likes_left", "popl_rl.testing:likes_right"]
-RATERS = RatersConfig(groups=LEFT_RIGHT, count=6, answers=10)
-
-
-@pytest.fixture
-def world():
-    return build_world(TINY)
-
-
-@pytest.fixture
-def tiny_groups(world):
-    return build_groups(RATERS, world)
-
-
-def collect(world, groups, *, seed=0, load=None, segments=30, **arguments):
-    data = DataConfig(segments=segments, length=4, **arguments)
-    return make_data(data, RATERS, world, groups, seed=seed, env=EnvConfig(max_steps=8), load=load)
 
 
 def everything_equal(one, other):
@@ -63,14 +44,14 @@ def test_a_world_offers_what_its_environment_has(world):
 
 WALK = """
 import torch
-from popl_rl.testing import _Walk
+from popl_rl.testing import tiny_env
 
 
 def go_right(step, generator):
     return torch.ones(step.batch_size, dtype=torch.long)
 
 
-class Walk(_Walk):
+class Walk(type(tiny_env())):
     def __init__(self, cells="few"):
         super().__init__(8)
         self.cells = cells
@@ -155,10 +136,10 @@ def test_patterns_divide_their_share_equally():
     assert both["planner/a"] == 0.75
 
 
-def test_groups_answer_as_configured(world):
+def test_groups_answer_as_configured(world, asked):
     response = ResponseConfig(rationality=2.0, mistake=0.1, myopia=0.9, tie=0.2, skip=0.3)
     for label in ("regret", "return"):
-        config = RatersConfig(groups=LEFT_RIGHT, label=label, response=response)
+        config = RatersConfig(groups=asked.groups, label=label, response=response)
         groups = build_groups(config, world)
         assert [group.name for group in groups] == ["likes_left", "likes_right"]
         for group in groups:
@@ -180,7 +161,9 @@ def test_without_a_table_regret_waits_for_values_fitted_to_the_data():
     assert fitted.segment_utility.isfinite().all()
 
 
-def test_stored_segments_are_collected_once_and_linked(world, tiny_groups, tmp_path, monkeypatch):
+def test_stored_segments_are_collected_once_and_linked(
+    world, tiny_groups, tmp_path, monkeypatch, collect
+):
     collected = []
 
     def counting(*arguments, **options):
@@ -205,17 +188,17 @@ def test_stored_segments_are_collected_once_and_linked(world, tiny_groups, tmp_p
     assert loaded.store == one.store
 
 
-def test_a_seed_of_the_data_makes_runs_share_segments_but_not_answers(world, tiny_groups):
+def test_a_seed_of_the_data_makes_runs_share_segments_but_not_answers(world, tiny_groups, asked):
     data = DataConfig(segments=30, length=4, seed=7)
     one, other = (
-        make_data(data, RATERS, world, tiny_groups, seed=seed, env=EnvConfig(max_steps=8))
+        make_data(data, asked, world, tiny_groups, seed=seed, env=EnvConfig(max_steps=8))
         for seed in (0, 1)
     )
     assert everything_equal(one.steps, other.steps)
     assert not everything_equal(one.preferences, other.preferences)
 
 
-def test_data_are_reproducible_and_saved_data_come_back(world, tiny_groups, tmp_path):
+def test_data_are_reproducible_and_saved_data_come_back(world, tiny_groups, tmp_path, collect):
     data = collect(world, tiny_groups)
     assert data.steps.batch_size == (30, 4)
     assert set(data.preferences.keys(True, True)) == {PAIR, ANSWER, RATER, GROUP, UTILITY}
@@ -235,22 +218,22 @@ def test_data_are_reproducible_and_saved_data_come_back(world, tiny_groups, tmp_
     assert torch.equal(loaded.segment_utility, data.segment_utility)
 
 
-def test_saving_again_replaces_nothing(world, tiny_groups, tmp_path):
+def test_saving_again_replaces_nothing(world, tiny_groups, tmp_path, collect):
     data = collect(world, tiny_groups)
     data.save(tmp_path)
     collect(world, tiny_groups, seed=1).save(tmp_path)
     assert everything_equal(collect(world, tiny_groups, load=tmp_path).steps, data.steps)
 
 
-def test_asking_more_raters_leaves_the_segments_alone(world, tiny_groups):
-    more = RatersConfig(groups=LEFT_RIGHT, count=9, answers=3)
+def test_asking_more_raters_leaves_the_segments_alone(world, tiny_groups, asked):
+    more = RatersConfig(groups=asked.groups, count=9, answers=3)
     data = DataConfig(segments=30, length=4)
-    one = make_data(data, RATERS, world, tiny_groups, seed=0, env=EnvConfig(max_steps=8))
+    one = make_data(data, asked, world, tiny_groups, seed=0, env=EnvConfig(max_steps=8))
     other = make_data(data, more, world, tiny_groups, seed=0, env=EnvConfig(max_steps=8))
     assert everything_equal(one.steps, other.steps)
 
 
-def test_segments_may_be_memory_mapped(world, tiny_groups, tmp_path):
+def test_segments_may_be_memory_mapped(world, tiny_groups, tmp_path, collect):
     mapped = collect(world, tiny_groups, memmap=str(tmp_path / "map"))
     assert list((tmp_path / "map").rglob("*.memmap"))
     in_memory = collect(world, tiny_groups)
@@ -258,21 +241,21 @@ def test_segments_may_be_memory_mapped(world, tiny_groups, tmp_path):
     assert everything_equal(mapped.preferences, in_memory.preferences)
 
 
-def test_progress_is_told(world, tiny_groups):
+def test_progress_is_told(world, tiny_groups, asked):
     told = []
     data, env = DataConfig(segments=30, length=4), EnvConfig(max_steps=8)
-    make_data(data, RATERS, world, tiny_groups, seed=0, env=env, progress=told.append)
+    make_data(data, asked, world, tiny_groups, seed=0, env=env, progress=told.append)
     assert told[-1] == 30
 
 
-def test_too_little_data_are_refused(world, tiny_groups, tmp_path):
+def test_too_little_data_are_refused(world, tiny_groups, tmp_path, collect):
     collect(world, tiny_groups).save(tmp_path)
     message = "data.segments asks for 31 segments, but .* holds 30; ask for fewer or collect more"
     with pytest.raises(ValueError, match=message):
         collect(world, tiny_groups, load=tmp_path, segments=31)
 
 
-def test_data_of_another_environment_are_refused(world, tiny_groups, tmp_path):
+def test_data_of_another_environment_are_refused(world, tiny_groups, tmp_path, collect):
     collect(world, tiny_groups).save(tmp_path)
     other = build_world(EnvConfig(factory="gymnasium:make", id="CartPole-v1"))
     message = r"holds observations of shape \(5,\), but the environment gives \(4,\)"
@@ -280,14 +263,14 @@ def test_data_of_another_environment_are_refused(world, tiny_groups, tmp_path):
         collect(other, tiny_groups, load=tmp_path)
 
 
-def test_data_of_more_groups_are_refused(world, tiny_groups, tmp_path):
+def test_data_of_more_groups_are_refused(world, tiny_groups, tmp_path, collect):
     collect(world, tiny_groups).save(tmp_path)
     message = "holds preferences of 2 groups, but raters.groups names 1; name the groups that were"
     with pytest.raises(ValueError, match=message):
         collect(world, tiny_groups[:1], load=tmp_path)
 
 
-def test_foreign_data_are_refused(world, tiny_groups, tmp_path):
+def test_foreign_data_are_refused(world, tiny_groups, tmp_path, collect):
     save_tensordict(TensorDict({"observation": torch.zeros(30, 4, 5)}, [30]), tmp_path / "segments")
     with pytest.raises(ValueError, match="does not hold what was expected: 'action'"):
         collect(world, tiny_groups, load=tmp_path)

@@ -17,12 +17,12 @@ from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 from rich.console import Console
 
+from popl_rl.config import load_config
 from popl_rl.experiments.loggers import Progress, make_logger
 from popl_rl.experiments.metrics import MetricsWriter
 from popl_rl.experiments.run_folder import (
     create_run_dir,
     git_state,
-    load_config,
     save_config,
     write_metadata,
 )

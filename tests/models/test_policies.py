@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import nn
+from torchrl.envs import ExplorationType, set_exploration_type
 
 from popl_rl.models.policies import PolicySpec, build_actor, build_network, log_prob
 from popl_rl.testing import tiny_env
@@ -152,6 +153,27 @@ def test_actors_act(generator):
         action = actor(observation.clone())["action"]
         assert action.dtype == dtype
         assert action.shape == shape
+
+
+def test_actions_that_begin_elsewhere_by_hand():
+    """Logits (ln 3, 0) over the actions 5 and 6: chances 3/4 and 1/4."""
+    spec = PolicySpec(1, 2, True, (), first_action=5)
+    network = nn.Sequential(nn.Linear(1, 2))
+    torch.nn.init.zeros_(network[0].weight)
+    network[0].bias.data = torch.tensor([math.log(3), 0.0])
+    actor = build_actor(spec, network)
+    step = TensorDict({"observation": torch.zeros(400, 1)}, [400])
+    assert actor(step.clone())["action"].unique().tolist() == [5], "the most likely"
+    with torch.random.fork_rng(), set_exploration_type(ExplorationType.RANDOM):
+        drawn = actor(step.clone())["action"]
+    assert drawn.unique().tolist() == [5, 6]
+    assert 0.65 < float((drawn == 5).float().mean()) < 0.85
+    distribution = actor.get_dist(step)
+    log_prob = distribution.log_prob(torch.tensor([5, 6]).repeat(200)).exp()
+    torch.testing.assert_close(log_prob, torch.tensor([0.75, 0.25]).repeat(200))
+    wide = distribution.expand([2, 400])
+    assert wide.mode.shape == (2, 400)
+    torch.testing.assert_close(wide.entropy(), distribution.entropy().expand(2, -1))
 
 
 def test_a_gaussian_actor_has_the_spread_of_its_spec():

@@ -223,6 +223,25 @@ def test_an_actor_is_one_of_the_policies(two):
     torch.testing.assert_close(probabilities, torch.tensor([[0.25, 0.75]] * 4))
 
 
+def test_actions_are_those_of_the_environment(two, generator, tmp_path):
+    """Of Discrete(2, start=7), also after saving; of sets without a start they begin with 0."""
+    networks = [two.population.network(member) for member in (0, 1)]
+    policies = PolicySet(Population(networks, PolicySpec(1, 2, True, (), first_action=7)))
+    batch = torch.ones(50, 1)
+    policies.save(tmp_path / "later")
+    for found in (policies, PolicySet.load(tmp_path / "later"), policies.subset([0, 1])):
+        assert found.act(torch.ones(1), greedy=True).tolist() == [7, 8]
+        drawn = found.act(batch, member=0, generator=generator)
+        assert drawn.unique().tolist() == [7, 8]
+        assert found.actor(1)(TensorDict({"observation": batch}, [50]))["action"].unique() == 8
+    about = tmp_path / "later" / "policy_set.json"
+    text = json.loads(about.read_text())
+    assert text["spec"].pop("first_action") == 7
+    about.write_text(json.dumps(text))
+    old = PolicySet.load(tmp_path / "later")
+    assert old.act(torch.ones(1), greedy=True).tolist() == [0, 1]
+
+
 def saved_set(path, *, discrete=True, evolve="head", hidden=(4, 3)):
     generator = torch.Generator().manual_seed(3)
     spec = PolicySpec(3, 2, discrete, hidden, 0.3)

@@ -58,6 +58,17 @@ def test_pairs_of_kept_starts_that_were_asked_all_the_same_are_left_out(generato
     assert unordered(pairs) == {frozenset(p) for p in [(6, 7), (7, 8), (9, 10), (10, 11)]}
 
 
+def test_the_number_of_pairs_by_hand():
+    """Of 4 segments 6 pairs; two starts of three segments have 3 each; asked ones are left out."""
+    assert PairPool(4).num_pairs == 6
+    assert PairPool(4, asked=torch.tensor([[0, 1], [1, 0], [3, 2]])).num_pairs == 4
+    assert PairPool(6, allowed=torch.arange(4), asked=torch.tensor([[0, 1], [4, 5]])).num_pairs == 5
+    asked = torch.tensor([[8, 6], [9, 11], [0, 1], [6, 9]])
+    pool = held_out_pool(segments_from(4, each=3), asked)
+    assert pool.num_pairs == 6 - 2
+    assert pool.num_pairs == len(unordered(pool.draw(300, generator=torch.Generator())))
+
+
 @pytest.mark.parametrize("starts", [1, 2])
 def test_too_few_starts_to_keep_some_are_refused(starts):
     segments = segments_from(starts, each=4)

@@ -102,17 +102,6 @@ def test_without_pymoo_nsga2_says_what_to_install(monkeypatch, generator):
     assert selection_rule("tournament") is not None, "others do without it"
 
 
-def test_every_rule_gives_parents_and_the_seed_decides(rule):
-    values = torch.rand(9, 5, generator=seeded())
-    parents = rule(values, 40, generator=seeded(1))
-    assert parents.dtype == torch.int64
-    assert parents.shape == (40,)
-    assert int(parents.min()) >= 0
-    assert int(parents.max()) < 9
-    assert torch.equal(parents, rule(values, 40, generator=seeded(1)))
-    assert not torch.equal(parents, rule(values, 40, generator=seeded(2)))
-
-
 @pytest.mark.parametrize(
     ("values", "count", "error", "message"),
     [
@@ -211,17 +200,6 @@ def test_the_rule_changes_nothing_before_parents_are_chosen(monkeypatch, bank, c
     seen = spied(other, monkeypatch)
     other.step()
     assert torch.equal(seen[0][1], wanted[0][1])
-
-
-@pytest.mark.parametrize("name", SELECTIONS)
-def test_popl_continues_to_the_bit(bank, comparisons, name):
-    straight = build(bank, comparisons, selection=name)
-    straight.step()
-    state = straight.state_dict()
-    expected = [straight.step() for _ in range(2)]
-    resumed = build(bank, comparisons, selection=name)
-    resumed.load_state_dict(state)
-    assert [resumed.step() for _ in range(2)] == expected
 
 
 def test_mixtures_are_selected_by_the_rule_too(bank, comparisons):

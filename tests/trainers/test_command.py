@@ -7,6 +7,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from popl_rl.experiments import reevaluation
 from popl_rl.trainers import evaluate_policies, train_popl
 
 RATERS = """
@@ -101,13 +102,13 @@ def test_evaluating_keeps_the_runs_settings_and_asks_other_raters(
     call, finished, copied, monkeypatch
 ):
     found = []
-    original = evaluate_policies.make_evaluator
+    original = reevaluation.make_evaluator
 
     def watch(*arguments, **options):
         found.append(original(*arguments, **options))
         return found[-1]
 
-    monkeypatch.setattr(evaluate_policies, "make_evaluator", watch)
+    monkeypatch.setattr(reevaluation, "make_evaluator", watch)
     for overrides in (["seed=0"], ["evaluation.answers=3", "evaluation.reference=others"]):
         code, text = call(evaluate_policies.cli, f"run_dir={copied}", *overrides)
         assert code == 0, text
@@ -159,6 +160,38 @@ def test_evaluating_with_unknown_settings(call, copied):
 )
 def test_what_the_user_can_put_right(train, overrides, parts):
     assert_explains(train(*overrides), *parts)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "parts"),
+    [
+        (
+            ["seeds=1"],
+            ["Could not override 'seeds': there is no ", "Did you mean 'seed'?"],
+        ),
+        (["raters.response.mistakes=0.2"], ["Did you mean 'raters.response.mistake'? --cfg job"]),
+        (["mistake=0.2"], ["Did you mean 'raters.response.mistake'?"]),
+        (["env.options.door=3"], ["appended, as in +env.options.door=..."]),
+        (["raters=three_group"], ["unknown raters 'three_group'. Did you mean 'three_groups'?"]),
+        (["env=metaworld/drawer"], ["unknown env 'metaworld/drawer'.", "Known:", "two_doors"]),
+        (["method=pople"], ["unknown method 'pople'. Did you mean 'popl'? Known: cpl, em, "]),
+    ],
+)
+def test_what_is_misspelt(call, overrides, parts):
+    assert_explains(call(train_popl.cli, *overrides), *parts)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["raters.groups=[uper,lower]"], "Did you mean 'upper'?"),
+        (["env.factory=two_dors"], "Did you mean 'two_doors'?"),
+        (["method.factory=x.py:Mine", "method.reads=[training,refinement]"], "no Python file"),
+    ],
+)
+def test_what_cannot_be_found_leaves_no_folder(train, tmp_path, overrides, said):
+    assert_explains(train(*overrides), said)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_setting_that_must_be_given(call, tiny):

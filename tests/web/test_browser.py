@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from popl_rl.config import EnvConfig
-from popl_rl.data.environments import build_world
 from popl_rl.evaluation.optimum import ExactReturns
+from popl_rl.experiments.data import build_world
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.raters.groups import make_groups
 from popl_rl.storage import load_tensordict

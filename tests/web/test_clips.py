@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from popl_rl.config import EnvConfig
-from popl_rl.data.environments import build_world
+from popl_rl.experiments.data import build_world
 from popl_rl.storage import save_tensordict
 from popl_rl.web.clips import Clip, film_strip, read_clip, write_clip
 from popl_rl.web.rendering import Scenes, policy_clips, segment_clips

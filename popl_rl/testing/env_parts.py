@@ -1,10 +1,9 @@
-"""The single checks behind :func:`popl_rl.testing.check_env`; each raises with a cure.
+"""The single checks behind ``popl_rl.testing.check_env``; each raises with a cure.
 
 ``name`` is what messages call the environment.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -19,8 +18,17 @@ from popl_rl.data.behaviours import first_action
 from popl_rl.data.environments import counting_from_zero
 from popl_rl.data.tables import Table
 from popl_rl.keys import ACTION, INFO, OBSERVATION, REWARD
+from popl_rl.testing.plug_ins import Env, call
 
-Env: TypeAlias = gymnasium.Env[Any, Any]
+__all__ = [
+    "Step",
+    "check_behaviours",
+    "check_repeats",
+    "check_spaces",
+    "check_table",
+    "check_torchrl",
+    "random_steps",
+]
 
 
 class Step(NamedTuple):
@@ -31,15 +39,6 @@ class Step(NamedTuple):
     reward: float
     terminated: bool
     info: dict[str, float]
-
-
-def call(name: str, doing: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-    """Call what the author wrote; what that raises becomes the cause of a ValueError."""
-    try:
-        return function(*args, **kwargs)
-    except Exception as error:
-        message = f"env {name!r}: {doing} failed with {type(error).__name__}: {error}"
-        raise ValueError(message) from error
 
 
 def check_spaces(name: str, env: Env) -> None:
@@ -78,7 +77,7 @@ def random_steps(name: str, env: Env, num_steps: int, seed: int) -> list[Step]:
     for _ in range(num_steps):
         if over:
             # Later episodes go on from the first seed, which a careless reset would also get wrong.
-            answer = call(name, "reset", env.reset, seed=seed if first_reset else None)
+            answer = call("env", name, "reset", env.reset, seed=seed if first_reset else None)
             first_reset = False
             if not isinstance(answer, tuple) or len(answer) != 2:
                 raise TypeError(
@@ -88,7 +87,7 @@ def random_steps(name: str, env: Env, num_steps: int, seed: int) -> list[Step]:
             action, (observation, info), reward, terminated, over = None, answer, 0.0, False, False
         else:
             action = env.action_space.sample()
-            answer = call(name, "step", env.step, action)
+            answer = call("env", name, "step", env.step, action)
             if not isinstance(answer, tuple) or len(answer) != 5:
                 raise TypeError(
                     f"env {name!r}: step must return (observation, reward, terminated, truncated, "

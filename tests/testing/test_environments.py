@@ -1,6 +1,6 @@
+"""The check of an environment."""
+
 import math
-import subprocess
-import sys
 
 import gymnasium
 import numpy as np
@@ -9,7 +9,7 @@ import torch
 
 from popl_rl import registry
 from popl_rl.data.tables import Table
-from popl_rl.testing import check_env, check_rater, likes_left, main, tiny_env
+from popl_rl.testing import check_env, check_rater, likes_left, tiny_env
 
 Box, Discrete = gymnasium.spaces.Box, gymnasium.spaces.Discrete
 Good = type(tiny_env())
@@ -284,7 +284,7 @@ def test_what_torchrl_refuses_is_reported(monkeypatch):
     def refuse(env):
         raise AssertionError("specs differ")
 
-    monkeypatch.setattr("popl_rl._env_checks.check_env_specs", refuse)
+    monkeypatch.setattr("popl_rl.testing.env_parts.check_env_specs", refuse)
     with pytest.raises(ValueError, match="failed with AssertionError: specs differ"):
         check_env(tiny_env)
 
@@ -316,34 +316,3 @@ def test_checking_leaves_the_global_randomness_alone():
 def test_importing_registers_nothing():
     assert "tiny_env" not in registry.names("env")
     assert "likes_left" not in registry.names("rater")
-
-
-def test_command_line(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.py").write_text("def rude(segments):\n    return segments['shoe\\nsize']\n")
-    assert main(["env", "two_doors", "--with", "doors=3", "start=anywhere"]) == 0
-    assert capsys.readouterr().out == "env two_doors: all checks passed\n"
-    assert main(["rater", "lower", "--env", "two_doors", "--with", "size=7"]) == 0
-    assert capsys.readouterr().out == "rater lower: all checks passed\n"
-    assert main(["rater", "mine.py:rude"]) == 2
-    faults = capsys.readouterr()
-    assert faults.out == ""
-    assert faults.err.startswith("rater 'rude' failed on segments")
-    assert faults.err.count("\n") == 1
-    assert main(["env", "two_door"]) == 2
-    assert "Did you mean 'two_doors'?" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("arguments", [[], ["env"], ["env", "two_doors", "--with", "doors"]])
-def test_command_line_misuse(arguments, capsys):
-    with pytest.raises(SystemExit) as caught:
-        main(arguments)
-    assert caught.value.code == 2
-    assert "usage: python -m popl_rl.testing" in capsys.readouterr().err
-
-
-def test_module_runs():
-    command = [sys.executable, "-m", "popl_rl.testing", "env", "popl_rl.testing:tiny_env"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout == "env popl_rl.testing:tiny_env: all checks passed\n"

@@ -1,0 +1,76 @@
+"""Evaluating the policies of a finished run again, into a folder of its own in the run's folder."""
+
+from pathlib import Path
+
+import torch
+
+from popl_rl.config import Config
+from popl_rl.evaluation.diagnostics import diagnostics
+from popl_rl.evaluation.results import Scoreboard
+from popl_rl.experiments.builders import build_spec
+from popl_rl.experiments.data import build_groups, build_world, make_data
+from popl_rl.experiments.evaluators import make_evaluator
+from popl_rl.experiments.report import markdown
+from popl_rl.experiments.run_folder import save_config
+from popl_rl.models.policy_set import PolicySet
+from popl_rl.models.reward_set import RewardSet
+from popl_rl.models.sets import load_set
+from popl_rl.storage import write_atomic, written_beside
+
+__all__ = ["evaluate_again"]
+
+
+def evaluate_again(config: Config, run_dir: Path, *, seed: int) -> tuple[Path, Scoreboard]:
+    """Evaluate what a run found by these settings.
+
+    Args:
+        config: The run's settings, with what is to differ in the section ``evaluation``.
+        run_dir: Folder of the run, whose segments and preferences are used again.
+        seed: Seed of the held-out pairs, new raters and episodes.
+
+    Returns:
+        The folder that was written, ``evaluations/<number>``, and the scoreboard.
+
+    Raises:
+        FileNotFoundError: If the run has found no set yet.
+        ValueError: If what the run has kept is damaged, or settings do not go together.
+    """
+    torch.set_num_threads(config.threads)
+    is_reward = (run_dir / RewardSet.folder).is_dir()
+    found = load_set(run_dir / (RewardSet if is_reward else PolicySet).folder)
+    base_path, clone_path, kept = (run_dir / name for name in ("baselines", "clone", "data"))
+    baselines = None
+    if config.evaluation.baselines and base_path.is_dir():
+        baselines = load_set(base_path)
+    world = build_world(config.env)
+    groups = build_groups(config.raters, world)
+    given = None if config.data.load is None else Path(config.data.load)
+    data = make_data(
+        config.data,
+        config.raters,
+        world,
+        groups,
+        seed=config.seed,
+        env=config.env,
+        load=kept if kept.is_dir() else given,
+    )
+    spec = build_spec(config.method, world.env)
+    clone = load_set(clone_path) if clone_path.is_dir() else None
+    evaluator = make_evaluator(config, world, groups, data, spec, clone=clone, seed=seed)
+    board = evaluator.score(found, baselines, label=config.method.name)
+    number = 1 + len(list((run_dir / "evaluations").glob("[0-9]*")))
+    folder = run_dir / "evaluations" / f"{number:03d}"
+    about = {
+        "answers of each new rater": config.evaluation.answers,
+        "seed": seed,
+        **diagnostics(board, evaluator),
+    }
+    title = f"Evaluation {number} of {run_dir.name}"
+    report = markdown(board.results, title=title, about=about, figures=[])
+    with written_beside(folder) as beside:
+        save_config(
+            beside, {"run_dir": str(run_dir), "evaluation": config.evaluation, "seed": seed}
+        )
+        write_atomic(beside / "results.csv", board.results.to_csv(index=False))
+        write_atomic(beside / "report.md", report)
+    return folder, board

@@ -1,0 +1,48 @@
+"""The check of an environment."""
+
+from typing import Any
+
+from popl_rl.testing.env_parts import (
+    check_behaviours,
+    check_repeats,
+    check_spaces,
+    check_table,
+    check_torchrl,
+    random_steps,
+)
+from popl_rl.testing.plug_ins import EnvReference, call, made_env, name_of, offers
+
+__all__ = ["check_env"]
+
+
+def check_env(env: EnvReference, *, num_steps: int = 200, seed: int = 0, **arguments: Any) -> None:
+    """Check that an environment can be used here; the first fault found is raised.
+
+    Args:
+        env: An environment, its factory, or a reference to the factory (see ``popl_rl.registry``).
+        num_steps: Random steps to take.
+        seed: Seed of episodes and actions.
+        **arguments: Keyword arguments for the factory.
+
+    Raises:
+        TypeError: If spaces, observations, rewards or infos are of another kind than expected.
+        ValueError: If the environment fails, is not reproducible, gives numbers out of its space or
+            not finite, changes its info keys, fails TorchRL's check, or has a transition table or
+            behaviours that do not describe it.
+
+    Example:
+        >>> from popl_rl.testing import check_env, tiny_env
+        >>> check_env(tiny_env)
+    """
+    name = name_of(env)
+    with made_env(name, env, arguments) as made:
+        check_spaces(name, made)
+        steps = random_steps(name, made, num_steps, seed)
+        check_repeats(name, steps, random_steps(name, made, num_steps, seed))
+        if offers(made, "transition_table"):
+            table = call("env", name, "transition_table", offers(made, "transition_table"))
+            check_table(name, table, made, steps)
+        if offers(made, "behaviours"):
+            found = call("env", name, "behaviours", offers(made, "behaviours"))
+            check_behaviours(name, found)
+        check_torchrl(name, made)

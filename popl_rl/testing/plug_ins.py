@@ -1,0 +1,108 @@
+"""Calling what other people wrote, so that whatever it does wrong can be told."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeAlias
+
+import gymnasium
+import torch
+from tensordict import TensorDictBase
+
+from popl_rl import registry
+from popl_rl.data.behaviours import random_behaviour
+from popl_rl.data.rollouts import MASK, lockstep
+from popl_rl.data.segments import cut_segments
+
+__all__ = [
+    "Env",
+    "EnvReference",
+    "call",
+    "identical",
+    "made_env",
+    "name_of",
+    "offers",
+    "random_segments",
+]
+
+Env: TypeAlias = gymnasium.Env[Any, Any]
+EnvReference: TypeAlias = str | Env | Callable[..., Env]
+
+
+def call(
+    kind: str, name: str, doing: str, function: Callable[..., Any], *args: Any, **kwargs: Any
+) -> Any:
+    """Call what the author wrote; what that raises becomes the cause of a ValueError.
+
+    Args:
+        kind: Kind of the plug-in, such as ``"env"``.
+        name: What messages call it.
+        doing: What is being done, such as ``"reset"``.
+        function: What is called, with the arguments that follow.
+        *args: Its arguments.
+        **kwargs: Its keyword arguments.
+    """
+    try:
+        return function(*args, **kwargs)
+    except Exception as error:
+        message = f"{kind} {name!r}: {doing} failed with {type(error).__name__}: {error}"
+        raise ValueError(message) from error
+
+
+def name_of(thing: Any) -> str:
+    """What messages call a plug-in: what follows ':' in a reference, or the object's own name."""
+    if isinstance(thing, str):
+        return thing.rpartition(":")[2]
+    return getattr(thing, "__name__", type(thing).__name__)
+
+
+@contextmanager
+def made_env(name: str, env: EnvReference, arguments: dict[str, Any]) -> Iterator[Env]:
+    """Yield the environment, and close it if it was made here."""
+    if isinstance(env, gymnasium.Env):
+        if arguments:
+            raise TypeError(
+                f"env {name!r} is made already and takes no arguments, got {arguments}."
+            )
+        yield env
+        return
+    factory = registry.resolve("env", env) if isinstance(env, str) else env
+    if not callable(factory):
+        raise TypeError(
+            f"env must be a gymnasium.Env, a function that makes one, or a reference to it, got a "
+            f"{type(env).__name__}."
+        )
+    made = call("env", name, "making it", factory, **arguments)
+    if not isinstance(made, gymnasium.Env):
+        raise TypeError(
+            f"env {name!r} must return a gymnasium.Env, got a {type(made).__name__}; subclass "
+            "gymnasium.Env, or wrap what you have."
+        )
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def offers(env: Env, method: str) -> Any:
+    """Return an optional method of an environment, below its wrappers, or None."""
+    return getattr(env.unwrapped, method, None)
+
+
+def random_segments(env: Env, seed: int) -> TensorDictBase:
+    """Return segments of random actions, of 5 steps unless episodes are shorter."""
+    generator = torch.Generator().manual_seed(seed)
+    acts = random_behaviour(env.action_space)
+    episodes = [
+        lockstep([env], lambda step: acts(step, generator), seeds=[seed + index], max_steps=50)
+        for index in range(8)
+    ]
+    length = min(5, *(int(episode[MASK].sum()) for episode in episodes))
+    return torch.cat([cut_segments(episode, length) for episode in episodes])
+
+
+def identical(one: TensorDictBase, other: TensorDictBase) -> bool:
+    """Whether two TensorDicts have the same keys and, to the bit, the same values."""
+    keys = set(one.keys(True, True))
+    return keys == set(other.keys(True, True)) and all(
+        torch.equal(one[key], other[key]) for key in keys
+    )
