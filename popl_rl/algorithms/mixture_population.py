@@ -295,7 +295,7 @@ class MixturePOPL:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from ``state_dict``, bit for bit."""
+        """Continue from :meth:`state_dict`, bit for bit."""
         self.generation = int(state["generation"])
         self.population.members.data.update_(state["members"])
         self.active, self.share = state["active"].clone(), state["share"].clone()

@@ -1,8 +1,8 @@
 """From an evolved population to the few policies that people get: which to keep, one last training.
 
 Selection finds out who there is. What it leaves is many members that serve the same raters nearly
-alike, each trained on whatever it was selected for last. ``smallest_subset`` keeps as few as
-predict the raters as well as more of them do, and ``refine`` trains each on those whom it
+alike, each trained on whatever it was selected for last. :func:`smallest_subset` keeps as few as
+predict the raters as well as more of them do, and :func:`refine` trains each on those whom it
 serves: EM (Dempster, Laird and Rubin, 1977) from where evolution has ended, which has also told it
 how many there are.
 """
@@ -44,7 +44,7 @@ def predictive(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
 def smallest_subset(likelihood: Tensor, comparisons: Comparisons, *, most: int = 8) -> list[int]:
     """As few members as predict the raters as well as more of them do.
 
-    Members are added one after the other, each time the one that helps ``predictive`` most.
+    Members are added one after the other, each time the one that helps :func:`predictive` most.
     Of these nested subsets the smallest within one standard error of the best is taken (Breiman et
     al., 1984): a further member has to earn its place.
 
