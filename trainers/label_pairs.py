@@ -57,7 +57,7 @@ def prepare(config: LabelConfig) -> Labelling:
     """
     config = plain(config)
     validate(config)
-    from popl_rl.web.server import listen, require_extra
+    from popl_rl.web.extra import require_extra
 
     require_extra()
     from popl_rl.web.guards import guards, hosts_of
@@ -65,6 +65,7 @@ def prepare(config: LabelConfig) -> Labelling:
     from popl_rl.web.label_store import LabelStore
     from popl_rl.web.labels import export
     from popl_rl.web.pages import Pages
+    from popl_rl.web.server import listen
 
     options, out = config.label, Path(config.out)
     address = listen(config.page.host, config.page.port)

@@ -60,7 +60,9 @@ def prepare(config: ServeConfig) -> Serving:
     """
     config = plain(config)
     validate(config)
-    from popl_rl.web.server import listen, require_extra
+    run_dir = Path(config.run_dir)
+    stored: Config = plain(OmegaConf.merge(OmegaConf.structured(Config), load_config(run_dir)))
+    from popl_rl.web.extra import require_extra
 
     require_extra()
     import torch
@@ -69,10 +71,9 @@ def prepare(config: ServeConfig) -> Serving:
     from popl_rl.web.guards import guards, hosts_of
     from popl_rl.web.pages import Pages
     from popl_rl.web.serve_app import ServePages
+    from popl_rl.web.server import listen
 
     torch.set_num_threads(1)
-    run_dir = Path(config.run_dir)
-    stored: Config = plain(OmegaConf.merge(OmegaConf.structured(Config), load_config(run_dir)))
     world = build_world(stored.env)
     caterer = _caterer(config, run_dir, world)
     address = listen(config.page.host, config.page.port)

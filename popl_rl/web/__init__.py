@@ -5,7 +5,7 @@
   page and by program; who was served what; how it is found; what each policy does.
 * ``clips``, ``rendering``: what people see of segments and policies, and drawing it.
 * ``pages``, ``translations``: templates, forms, languages; ``guards``: what requests must pass.
-* ``database``: answers on disk; ``server``: running it.
+* ``database``: answers on disk; ``server``: running it; ``extra``: whether that is installed.
 
 Needs the extra ``web``: ``pip install 'popl_rl[web]'``.
 """

@@ -5,26 +5,12 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from importlib.util import find_spec
 
 from starlette.types import ASGIApp
 
 from popl_rl.web.guards import LOOPBACK
 
-__all__ = ["Address", "listen", "regularly", "require_extra", "run"]
-
-
-def require_extra() -> None:
-    """Raise unless what the pages need is installed.
-
-    Raises:
-        ValueError: With the command that installs it.
-    """
-    missing = [name for name in ("jinja2", "starlette", "uvicorn") if find_spec(name) is None]
-    if missing:
-        raise ValueError(
-            f"the pages need {', '.join(missing)}; install them with pip install 'popl_rl[web]'"
-        )
+__all__ = ["Address", "listen", "regularly", "run"]
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,7 @@ def visit(chromium):
 def labels(tmp_path_factory):
     """A page for labelling a small room: its address and folder."""
     out = tmp_path_factory.mktemp("labels") / "labels"
-    settings = [f"out={out}", ROOM, "data.segments=600", "label.count=150", "label.attention=6"]
+    settings = [f"out={out}", ROOM, "data.segments=200", "label.count=150", "label.attention=6"]
     settings += ["label.raters_per_pair=8", "page.rate=200", f"label.answers={ANSWERS}"]
     with server("label_pairs", *settings, "label.pause=25") as (url, _):
         yield url, out
@@ -230,7 +230,7 @@ def test_people_label_a_set_is_trained_and_each_finds_a_policy(
     page = visit(url)
     page.wait_for_timeout(6000)  # answers become data every five seconds
     run_dir = tmp_path / "run"
-    settings = [ROOM, f"data.load={out}", "data.segments=600", "evaluation.baselines=false"]
+    settings = [ROOM, f"data.load={out}", "data.segments=200", "evaluation.baselines=false"]
     settings += ["method.generations=20", "method.members=16", "method.training.steps=1500"]
     train_popl.run(config_of(*settings, "logger=csv", f"run_dir={run_dir}"))
     results = pd.read_csv(run_dir / "results.csv")
