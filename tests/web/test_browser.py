@@ -18,12 +18,12 @@ from popl_rl.raters.groups import make_groups
 from popl_rl.storage import load_tensordict
 from popl_rl.trainers import train_popl
 
-pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(1200)]
 
 CHROMIUM = shutil.which("chromium")
 DESKTOP, PHONE = {"width": 1100, "height": 800}, {"width": 390, "height": 780}
 ROOM = "env.options.size=7"
-RATERS, ANSWERS = 12, 40
+RATERS, ANSWERS = 8, 40
 
 
 @contextmanager

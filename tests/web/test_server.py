@@ -14,7 +14,7 @@ from popl_rl.web.server import listen, regularly, run
 def test_what_is_missing_is_told_with_the_command_that_installs_it(monkeypatch):
     extra.require_extra()
     found = importlib.util.find_spec
-    monkeypatch.setattr(extra, "find_spec", lambda name: name != "uvicorn" and found(name))
+    monkeypatch.setattr(extra, "find_spec", lambda name: None if name == "uvicorn" else found(name))
     with pytest.raises(ValueError, match=r"need uvicorn; .* pip install 'popl_rl\[web\]'"):
         extra.require_extra()
 
