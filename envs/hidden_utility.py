@@ -19,6 +19,7 @@ from popl_rl.registry import env, rater
 
 __all__ = [
     "HiddenUtility",
+    "blend",
     "coin",
     "cycle_0",
     "cycle_third",
@@ -26,6 +27,7 @@ __all__ = [
     "doubled",
     "hidden_utility",
     "plain",
+    "ring",
     "sample_states",
     "zeroed",
 ]
@@ -175,23 +177,54 @@ def plain(segments: TensorDictBase) -> Tensor:
 @rater("cycle_0")
 def cycle_0(segments: TensorDictBase) -> Tensor:
     """Want s to be large: the first of three groups whose majority prefers in circles."""
-    return _turned(segments, 0)
+    return ring(segments, 0, 3)
 
 
 @rater("cycle_third")
 def cycle_third(segments: TensorDictBase) -> Tensor:
     """Want s + 1/3, modulo 1, to be large: best just below 2/3, worst from there."""
-    return _turned(segments, 1)
+    return ring(segments, 1, 3)
 
 
 @rater("cycle_two_thirds")
 def cycle_two_thirds(segments: TensorDictBase) -> Tensor:
     """Want s + 2/3, modulo 1, to be large: best just below 1/3, worst from there."""
-    return _turned(segments, 2)
+    return ring(segments, 2, 3)
 
 
-def _turned(segments: TensorDictBase, thirds: int) -> Tensor:
-    return (_first(segments) + thirds / 3).remainder(1)
+@rater("ring")
+def ring(segments: TensorDictBase, place: float, places: float = 1) -> Tensor:
+    """Want s + place / places, modulo 1, to be large.
+
+    The utilities of neighbours on the ring overlap: two whose places are a share d apart order
+    ``d^2 + (1 - d)^2`` of all pairs of states alike.
+
+    Args:
+        segments: Segments ``[B, T]`` of :class:`HiddenUtility`.
+        place: Place on the ring.
+        places: Length of the ring.
+    """
+    return (_first(segments) + place / places).remainder(1)
+
+
+@rater("blend")
+def blend(segments: TensorDictBase, weight: float) -> Tensor:
+    """Want both coordinates of a state to be large, the first ``weight`` times as much.
+
+    Args:
+        segments: Segments ``[B, T]`` of :class:`HiddenUtility` with two coordinates (or more, of
+            which only two count).
+        weight: Weight of the first coordinate; the second has the rest to 1.
+
+    Raises:
+        ValueError: If states have a single coordinate.
+    """
+    states: Tensor = segments[OBSERVATION]
+    if states.shape[-1] < 2:
+        raise ValueError(
+            "rater 'blend' judges states of 2 coordinates, got 1; take env.options.dimensions=2."
+        )
+    return weight * states[..., 0] + (1 - weight) * states[..., 1]
 
 
 def _first(segments: TensorDictBase) -> Tensor:

@@ -19,6 +19,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from popl_rl.data.tables import Table, solve
+from popl_rl.envs.explorer import Explorer
 from popl_rl.keys import ACTION, INFO, OBSERVATION, REWARD
 from popl_rl.registry import env, rater
 
@@ -199,7 +200,7 @@ class TwoDoors(MiniGridEnv):
         start = first.bincount(minlength=num_states) / len(first)
         return Table(steps, next_state, goal, start)
 
-    def behaviours(self) -> dict[str, "Tensor | Explorer"]:
+    def behaviours(self) -> dict[str, Tensor | Explorer]:
         """Return what data can show: planners, an explorer and random actions.
 
         Returns:
@@ -250,56 +251,6 @@ class TwoDoors(MiniGridEnv):
         if before[0] < self.wall and after[0] == self.wall:
             return self.door_cells.index(after[:2])
         return -1
-
-
-class Explorer:
-    """Walks to one random cell after the other by a shortest path, through any door.
-
-    Without it no segment shows both doors, and then nothing that raters say about one door has to
-    do with what they say about another: without rater ids the groups could not be told apart.
-
-    Args:
-        table: The world's transitions.
-        cells: Column and row of every state, ``[S, 2]``.
-        slip: Chance of a uniformly random action.
-    """
-
-    def __init__(self, table: Table, cells: Tensor, *, slip: float = 0.1) -> None:
-        self.slip = slip
-        distinct, self._cell = cells.unique(dim=0, return_inverse=True)
-        # Fewest steps from each state to each cell, [cell, state]; never over the goal, where an
-        # episode would end.
-        far = torch.tensor(1e6)
-        distance = torch.where(self._cell == torch.arange(len(distinct)).unsqueeze(1), 0.0, far)
-        while True:
-            ahead = torch.where(table.terminal, far, 1 + distance[:, table.next_state])
-            shorter = torch.minimum(distance, ahead.amin(-1))
-            if torch.equal(shorter, distance):
-                break
-            distance = shorter
-        self._ahead = ahead
-        self._targets = (distance < far).any(1).nonzero().squeeze(-1)
-        ends = table.next_state[table.terminal]
-        self._targets = self._targets[~torch.isin(self._targets, self._cell[ends])]
-        self._target = torch.empty(0, dtype=torch.long)
-
-    def reset(self) -> None:
-        """Forget where everybody was going: a batch of new episodes begins."""
-        self._target = torch.empty(0, dtype=torch.long)
-
-    def __call__(self, step: TensorDictBase, generator: torch.Generator) -> Tensor:
-        """Return the actions ``[B]`` of a batch of walkers."""
-        state = step[INFO, "next_state"].long()
-        drawn = torch.randint(len(self._targets), state.shape, generator=generator)
-        fresh = self._targets[drawn]
-        arrived = self._cell[state] == self._target if len(self._target) else state >= 0
-        self._target = torch.where(arrived, fresh, self._target) if len(self._target) else fresh
-        ahead = self._ahead[self._target, state]
-        tie_break = torch.rand(ahead.shape, generator=generator) * 0.5
-        action = (ahead + tie_break).argmin(-1)
-        random = torch.randint(ahead.shape[-1], state.shape, generator=generator)
-        slips = torch.rand(state.shape, generator=generator) < self.slip
-        return torch.where(slips, random, action)
 
 
 @env("two_doors")

@@ -1,5 +1,8 @@
 """A reference becomes an object: a name, ``package.module:attr``, or ``path/file.py:attr``.
 
+Arguments may follow a rater's reference: ``ring(1, 12)`` is the function registered as ``ring``,
+called with the segments, 1 and 12. So one function stands for a family of groups.
+
 Nothing is known here by name. Objects are found because they were decorated (``env``, ``rater``,
 ``behaviour``) or because an installed package declares them as entry points in the group of its
 kind: ``popl_rl.env``, ``popl_rl.rater``, ``popl_rl.behaviour``, ``popl_rl.selection``,
@@ -7,6 +10,7 @@ kind: ``popl_rl.env``, ``popl_rl.rater``, ``popl_rl.behaviour``, ``popl_rl.selec
 worker processes carry.
 """
 
+import ast
 import difflib
 import hashlib
 import importlib
@@ -150,6 +154,10 @@ def resolve(kind: Kind, reference: str) -> Any:
         raise TypeError(
             f"{kind} reference must be a string, got {type(reference).__name__}. {_FORMS}"
         )
+    if kind == "rater" and reference.endswith(")"):
+        called, arguments = _arguments(reference)
+        found = resolve(kind, called)
+        return lambda segments: found(segments, *arguments)
     source, colon, attribute = reference.rpartition(":")
     if not colon:
         found = _by_name(kind, reference)
@@ -164,6 +172,19 @@ def resolve(kind: Kind, reference: str) -> Any:
             f"{kind} {reference!r} must name a function or class, got a {type(found).__name__}."
         )
     return found
+
+
+def _arguments(reference: str) -> tuple[str, tuple[Any, ...]]:
+    """Split ``name(1, 12)`` into the reference and its arguments."""
+    called, _, listed = reference[:-1].partition("(")
+    try:
+        arguments = ast.literal_eval(f"({listed},)") if listed.strip() else ()
+    except (SyntaxError, ValueError) as error:
+        raise ValueError(
+            f"rater {reference!r} has arguments that cannot be read; write numbers or quoted words, "
+            "as in ring(1, 12)."
+        ) from error
+    return called, arguments
 
 
 def _check_kind(kind: str) -> None:

@@ -214,7 +214,8 @@ def make_groups(
 
 def _named(reference: str | Utility) -> tuple[str, Utility]:
     if isinstance(reference, str):
-        return reference.rpartition(":")[2], registry.resolve("rater", reference)
+        name = reference.rpartition(":")[2].replace(" ", "")
+        return name, registry.resolve("rater", reference)
     if not callable(reference):
         raise TypeError(
             f"a rater must be a reference or a function, got a {type(reference).__name__}."
