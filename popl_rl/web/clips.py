@@ -5,8 +5,8 @@ strips are drawn at the same moment and so stay in step, which two animations do
 be stopped by people whom motion disturbs.
 
 Environments say how: ``render_segment(segment) -> frames`` draws one ``[T]`` from what it holds;
-``describe_segment(segment) -> str`` tells it in words; ``collect_segments(..., record=...)`` hands
-frames out while it collects again, where nothing but the simulator's state would do. Texts beside
+``describe_segment(segment) -> str`` tells it in words; ``record_segments(...)`` draws while it
+collects again, where nothing but the simulator's state would do. Texts beside
 the segments, ``texts.json``, come first. Where there is none of these the numbers are shown.
 """
 

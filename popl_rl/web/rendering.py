@@ -26,6 +26,7 @@ from popl_rl.web.clips import Clip, Clips, film_strip, read_clip, write_clip
 
 __all__ = ["Scenes", "policy_clips", "segment_clips"]
 
+_FILM_RATE = 20.0  # pictures per second of what an environment records itself
 _RATE = 10.0  # steps per second, where the environment does not say
 _BLOCK = 20  # clips between two reports of progress
 
@@ -143,7 +144,7 @@ def _render_segments(scenes: Scenes, wanted: list[int]) -> None:
     if hasattr(env, "record_segments"):
 
         def keep(index: int, frames: list[Any]) -> None:
-            write_clip(film_strip(frames, rate=rate), scenes.folder, index)
+            write_clip(film_strip(frames, rate=_FILM_RATE), scenes.folder, index)
 
         env.record_segments(segments, set(wanted), keep, generator=stream(scenes.seed, "segments"))
         return
