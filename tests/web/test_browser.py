@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.timeout(1200)]
 CHROMIUM = shutil.which("chromium")
 DESKTOP, PHONE = {"width": 1100, "height": 800}, {"width": 390, "height": 780}
 ROOM = "env.options.size=7"
-RATERS, ANSWERS = 8, 40
+RATERS, ANSWERS = 12, 60
 
 
 @contextmanager
@@ -82,8 +82,8 @@ def visit(chromium):
 def labels(tmp_path_factory):
     """A page for labelling a small room: its address and folder."""
     out = tmp_path_factory.mktemp("labels") / "labels"
-    settings = [f"out={out}", ROOM, "data.segments=200", "label.count=150", "label.attention=6"]
-    settings += ["label.raters_per_pair=8", "page.rate=200", f"label.answers={ANSWERS}"]
+    settings = [f"out={out}", ROOM, "data.segments=200", "label.count=800", "label.attention=6"]
+    settings += ["label.raters_per_pair=2", "page.rate=200", f"label.answers={ANSWERS}"]
     with server("label_pairs", *settings, "label.pause=25") as (url, _):
         yield url, out
 
@@ -136,7 +136,7 @@ def test_ten_pairs_by_keys_undo_reload_and_coming_back(labels, visit):
         press(page, key)
     ready(page)
     assert len(seen) == 12  # eleven pairs and a check
-    assert "Question 12 of 40" in page.title()
+    assert f"Question 12 of {ANSWERS}" in page.title()
     asked = question(page)
     page.reload()
     ready(page)
