@@ -15,7 +15,11 @@ from tensordict import TensorDict
 from popl_rl.envs._metaworld_scripts import Scripted
 from popl_rl.keys import ACTION, INFO, OBSERVATION, REWARD
 
-__all__ = ["Continued", "check_scripted", "collect_continuations"]
+__all__ = ["FILM_STEPS", "Continued", "check_scripted", "collect_continuations"]
+
+
+#: Steps between two pictures of a film.
+FILM_STEPS = 4
 
 
 class Continued(Protocol):
@@ -43,6 +47,10 @@ class Continued(Protocol):
         """Take an action ``[A]``."""
         ...
 
+    def render(self) -> Any:
+        """Return the present picture."""
+        ...
+
     def get_state(self) -> Any:
         """Return all that the episode goes on from."""
         ...
@@ -61,6 +69,8 @@ def collect_continuations(
     starts_per_episode: int = 6,
     generator: torch.Generator,
     progress: Callable[[int], None] | None = None,
+    films: Callable[[int], bool] | None = None,
+    keep: Callable[[int, TensorDict, list[Any]], None] | None = None,
 ) -> TensorDict:
     """Collect segments of which ``per_start`` at a time begin in one state.
 
@@ -76,6 +86,8 @@ def collect_continuations(
         starts_per_episode: States taken from one episode.
         generator: Source of seeds, of choices and of the behaviours' randomness.
         progress: Called with the number of segments collected so far.
+        films: Whether to draw the segment of a number; none of them if None.
+        keep: Called with number, steps and pictures of each segment that is drawn.
 
     Returns:
         TensorDict ``[starts * per_start, T]``; segments of one start follow each other, and
@@ -106,7 +118,11 @@ def collect_continuations(
             if start == starts:
                 break
             for style in torch.randperm(len(styles), generator=generator)[:per_start].tolist():
-                steps = _continue(env, visited[index], styles[style], length, generator)
+                drawn = films is not None and films(len(segments))
+                film: list[Any] | None = [] if drawn else None
+                steps = _continue(env, visited[index], styles[style], length, generator, film)
+                if keep is not None and film is not None:
+                    keep(len(segments), steps, film)
                 steps[INFO, "start"] = torch.full((length,), start)
                 segments.append(steps)
             if progress is not None:
@@ -176,18 +192,24 @@ def _continue(
     behaviour: Scripted,
     length: int,
     generator: torch.Generator,
+    film: list[Any] | None = None,
 ) -> TensorDict:
+    """Go on from a state; of a film, the pictures before every fourth step and after the last."""
     behaviour.reset()
     observation, _ = env.set_state(state)
     seen, done, rewards = [], [], []
     infos: list[Mapping[str, Any]] = []
-    for _ in range(length):
+    for time in range(length):
+        if film is not None and time % FILM_STEPS == 0:
+            film.append(env.render())
         action = behaviour.act(observation[None], generator)[0]
         seen.append(observation)
         done.append(action)
         observation, reward, _, _, info = env.step(action.numpy())
         rewards.append(reward)
         infos.append(info)
+    if film is not None:
+        film.append(env.render())
     columns = {name: torch.from_numpy(np.stack([i[name] for i in infos])) for name in infos[0]}
     return TensorDict(
         {

@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 
 from popl_rl.envs._metaworld_data import check_scripted, collect_continuations
 from popl_rl.envs._metaworld_scripts import Scripted
@@ -21,6 +21,7 @@ from popl_rl.envs._metaworld_simulator import (
     simulator,
     task_name,
 )
+from popl_rl.keys import ACTION
 
 __all__ = ["SPEEDS", "STEP_SECONDS", "MetaworldTask", "TaskState"]
 
@@ -239,6 +240,47 @@ class MetaworldTask(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             length=length,
             generator=generator,
             progress=progress,
+        )
+
+    def record_segments(
+        self,
+        segments: TensorDictBase,
+        wanted: Collection[int],
+        keep: Callable[[int, list[Any]], None],
+        *,
+        generator: torch.Generator,
+    ) -> None:
+        """Draw some of the segments that were collected here, by collecting them again.
+
+        A segment holds no state of the simulator, and nothing less would do.
+
+        Args:
+            segments: What ``collect_segments`` returned, ``[N, T]``.
+            wanted: Numbers of those to draw.
+            keep: Called with number and pictures of each, 20 for a second.
+            generator: In the state in which ``collect_segments`` was given it.
+
+        Raises:
+            ValueError: If these segments were not collected so.
+        """
+
+        def check(index: int, steps: TensorDict, film: list[Any]) -> None:
+            if not torch.equal(steps[ACTION], segments[ACTION][index]):
+                raise ValueError(
+                    f"segment {index} cannot be drawn: collected again, it comes out otherwise; "
+                    "segments must be of this environment, this seed and this machine"
+                )
+            keep(index, film)
+
+        speeds = len(self.speeds)
+        collect_continuations(
+            self,
+            starts=len(segments) // speeds,
+            per_start=speeds,
+            length=segments.shape[1],
+            generator=generator,
+            films=set(wanted).__contains__,
+            keep=check,
         )
 
     def render(self) -> NDArray[np.uint8]:  # type: ignore[override]

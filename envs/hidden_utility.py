@@ -89,6 +89,11 @@ class HiddenUtility(gymnasium.Env[Any, Any]):
         self._state, self._coin = self._drawn()
         return self._state, 0.0, False, self._time >= self.max_steps, {"coin": before}
 
+    def describe_segment(self, segment: TensorDictBase) -> str:
+        """Return a segment ``[T]`` in words: the numbers of each of its states."""
+        states = segment[OBSERVATION].tolist()
+        return "\n".join("  ".join(f"{number:.2f}" for number in state) for state in states)
+
     def _drawn(self) -> tuple[NDArray[np.float32], np.float32]:
         """Return a new state and its coin."""
         numbers = self.np_random.random(self.dimensions + 1, dtype=np.float32)

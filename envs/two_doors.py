@@ -157,6 +157,16 @@ class TwoDoors(MiniGridEnv):
         """Return the observation of the present state, in place of Minigrid's partial view."""
         return self._observation(*self._state())
 
+    def render_segment(self, segment: TensorDictBase) -> list[NDArray[np.uint8]]:
+        """Return the pictures of a segment ``[T]``: before its first step, and after each."""
+        self.reset(seed=0)
+        frames = []
+        for state in [int(segment[INFO, "state"][0]), *segment[INFO, "next_state"].tolist()]:
+            x, y, self.agent_dir = self.states[state]
+            self.agent_pos = (x, y)
+            frames.append(self.get_frame(highlight=False, tile_size=24))
+        return frames
+
     def transition_table(self) -> Table:
         """Return every transition of this environment, exactly."""
         num_states = len(self.states)

@@ -46,8 +46,9 @@ ALLOWED = {
     "envs": {"root", "data", "raters"},
     "configs": set(),
 }
+ALLOWED["web"] = {*ALLOWED["plotting"], "plotting", "selection"}
 ALLOWED["testing"] = {"root", "config", "selection", "data", "raters", "models", "algorithms"}
-ALLOWED["trainers"] = {*ALLOWED["experiments"], "experiments", "configs"}
+ALLOWED["trainers"] = {*ALLOWED["experiments"], "experiments", "web", "configs"}
 
 
 def _modules():

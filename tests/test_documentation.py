@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from popl_rl.config import Config
+from popl_rl.config import Config, LabelConfig, ServeConfig
 from popl_rl.experiments.tables import fill_tables, make_tables, read_tables
 from popl_rl.testing import check_env, check_rater
 from popl_rl.testing.command import main as check
@@ -21,7 +21,13 @@ ROOT = Path(__file__).parents[1]
 READMES = [Path(f, "README.md") for f in ("", "popl_rl", "envs", "trainers", "configs", "tests")]
 PAGES = [*READMES, *(Path(".github", name) for name in ("CONTRIBUTING.md", "CHANGELOG.md"))]
 TEXT = {page: (ROOT / page).read_text(encoding="utf-8") for page in PAGES}
-CONFIGS = {"popl-train": "train", "popl-evaluate": "evaluate", "popl-benchmark": "benchmark"}
+CONFIGS = {
+    "popl-train": "train",
+    "popl-evaluate": "evaluate",
+    "popl-benchmark": "benchmark",
+    "popl-label": "label",
+    "popl-serve": "serve",
+}
 NOT_TRAINING = ("method.popl.", "method.refinement.", "method.mixture.")
 
 
@@ -142,9 +148,17 @@ def documented_settings(section):
     return [name for cell in cells for name in re.findall(r"`([\w.]+)`", cell)]
 
 
-@pytest.mark.parametrize("section", ["raters", "data", "method", "evaluation"])
-def test_every_setting_is_documented_and_exists(section):
-    existing = set(settings_of(getattr(Config(), section)))
+@pytest.mark.parametrize(
+    ("schema", "section"),
+    [
+        *((Config, section) for section in ("raters", "data", "method", "evaluation")),
+        (LabelConfig, "label"),
+        (LabelConfig, "page"),
+        (ServeConfig, "serve"),
+    ],
+)
+def test_every_setting_is_documented_and_exists(schema, section):
+    existing = set(settings_of(getattr(schema(), section)))
     named = documented_settings(section)
     whole = tuple(name.removesuffix("...") + "." for name in named if name.endswith("..."))
     assert {name for name in existing - set(named) if not name.startswith(whole or "-")} == set()

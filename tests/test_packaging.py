@@ -49,7 +49,7 @@ def wheel(tmp_path_factory):
 
 
 def test_the_wheel_holds_the_tree(wheel):
-    kinds = {".py", ".yaml", ".typed"}
+    kinds = {".py", ".yaml", ".typed", ".html", ".css", ".js", ".json"}
     expected = {
         f"{inside}/{path.relative_to(ROOT / folder).as_posix()}": path.read_bytes()
         for folder, inside in TREES.items()

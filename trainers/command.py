@@ -12,7 +12,16 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from popl_rl.config import Config, EvaluateConfig, MethodConfig, plain, unread, validate
+from popl_rl.config import (
+    Config,
+    EvaluateConfig,
+    LabelConfig,
+    MethodConfig,
+    ServeConfig,
+    plain,
+    unread,
+    validate,
+)
 from popl_rl.trainers.spelling import explained
 
 __all__ = ["USER_ERRORS", "prepare", "register_schemas", "run_command"]
@@ -26,6 +35,8 @@ def register_schemas() -> None:
     store = ConfigStore.instance()
     store.store(name="schema", node=Config)
     store.store(name="evaluate_schema", node=EvaluateConfig)
+    store.store(name="label_schema", node=LabelConfig)
+    store.store(name="serve_schema", node=ServeConfig)
 
 
 def run_command(main: Callable[[], Any], schema: type = Config) -> None:

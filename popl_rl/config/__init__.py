@@ -2,8 +2,8 @@
 
 ``data``: environment, raters and segments; ``method``: methods, a section for each part;
 ``evaluation``: how the result is evaluated; ``run``: a whole run; ``stored``: those of an earlier
-run; ``checks``: how they check themselves; ``unread``: settings that the chosen method does not
-read.
+run; ``pages``: what people answer on; ``checks``: how they check themselves; ``unread``: settings
+that the chosen method does not read.
 """
 
 from popl_rl.config.checks import Checker, parse_epsilon
@@ -21,6 +21,13 @@ from popl_rl.config.method import (
     Training,
     VPLSettings,
 )
+from popl_rl.config.pages import (
+    LabelConfig,
+    LabelSettings,
+    PageSettings,
+    ServeConfig,
+    ServeSettings,
+)
 from popl_rl.config.run import Config, EvaluateConfig, LoggerConfig, plain, validate
 from popl_rl.config.stored import load_config
 from popl_rl.config.unread import unread
@@ -35,14 +42,19 @@ __all__ = [
     "EnvConfig",
     "EvaluateConfig",
     "EvaluationConfig",
+    "LabelConfig",
+    "LabelSettings",
     "LoggerConfig",
     "MethodConfig",
     "MixtureSettings",
     "NicheSettings",
     "POPLSettings",
+    "PageSettings",
     "RatersConfig",
     "RefinementSettings",
     "ResponseConfig",
+    "ServeConfig",
+    "ServeSettings",
     "Training",
     "VPLSettings",
     "load_config",

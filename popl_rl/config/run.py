@@ -1,7 +1,7 @@
 """Settings of a whole run, and one check of it all."""
 
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, Protocol
 
 from omegaconf import MISSING, DictConfig, OmegaConf
 
@@ -10,7 +10,15 @@ from popl_rl.config.data import DataConfig, EnvConfig, RatersConfig
 from popl_rl.config.evaluation import EvaluationConfig
 from popl_rl.config.method import MethodConfig
 
-__all__ = ["Config", "EvaluateConfig", "LoggerConfig", "plain", "validate"]
+__all__ = ["Checked", "Config", "EvaluateConfig", "LoggerConfig", "plain", "validate"]
+
+
+class Checked(Protocol):
+    """Settings that know what they may be."""
+
+    def check(self, at: Checker) -> None:
+        """Report values that are out of range."""
+        ...
 
 
 @dataclass
@@ -79,7 +87,7 @@ def plain(config: Any) -> Any:
     return OmegaConf.to_object(config) if isinstance(config, DictConfig) else config
 
 
-def validate(config: Config) -> None:
+def validate(config: Checked) -> None:
     """Check values that can be checked before anything is built.
 
     Raises:

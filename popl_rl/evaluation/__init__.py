@@ -3,7 +3,8 @@
 - What hypotheses do: ``acting`` rolls policies out, plans for reward functions or chooses items;
   ``ppo`` trains policies on reward functions, with episodes from ``ppo_episodes``.
 - What that is worth: ``measures`` of episodes and rankings, ``optimum`` with exact returns,
-  ``best_of_set``, ``held_out_raters`` and ``ranking_agreement``.
+  ``best_of_set`` and its worth in ``hindsight``, ``held_out_raters`` and ``ranking_agreement``; by
+  the number of answers, to drawn or to ``chosen_questions``, in ``catering_curves``.
 - What is told: ``evaluator`` fills the ``results`` of a run by a ``protocol``, ``diagnostics`` puts
   into words what stands out, ``statistics`` summarises groups and seeds, ``method_names`` says what
   methods are called, and ``suite`` what a benchmark compares.

@@ -1,8 +1,9 @@
 """The scoreboard of a run: every method, every group, every measure, in tidy rows.
 
 Rows are ``method, choice, group, measure, value``. The choice is how a member was chosen from a
-set: ``posterior`` or ``lexicase`` catering, ``expectation`` or ``risk_averse``; it is empty where
-there is one hypothesis only, and for measures of a set as a whole.
+set: ``posterior`` or ``lexicase`` catering; ``information_gain``, posterior catering to answers to
+questions that were chosen instead of drawn (curves alone); ``expectation`` or ``risk_averse``; it
+is empty where there is one hypothesis only, and for measures of a set as a whole.
 
 For each group and choice: ``return, recovery, success, accuracy, best_accuracy`` of what new raters
 are given after ``evaluation.answers`` answers; ``accuracy@K`` and ``recovery@K`` after K answers.
@@ -20,7 +21,7 @@ of held-out raters, its accuracy for the worst rater of another panel (``fair_wo
 (``fair_recovery``).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 
 import torch
@@ -31,8 +32,11 @@ from popl_rl.algorithms.reward_baselines import RewardBaselines
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.evaluation.acting import Acting, Choosing, Optimising, Rolling
-from popl_rl.evaluation.best_of_set import best_of_set, lowest, to_roll
+from popl_rl.evaluation.best_of_set import lowest, to_roll
+from popl_rl.evaluation.catering_curves import score_curves
+from popl_rl.evaluation.chosen_questions import ask_new_raters
 from popl_rl.evaluation.held_out_raters import draw_held_out_raters, favourites, gain
+from popl_rl.evaluation.hindsight import score_hindsight
 from popl_rl.evaluation.measures import (
     group_accuracy,
     group_returns,
@@ -287,50 +291,40 @@ class Evaluator:
                 rows.add(entry, index, done, served.share(index, chosen))
                 given = float(accuracy[chosen[index], index].mean())
                 rows.add_accuracy(entry, index, catered=given, best=most)
-        self._score_hindsight(label, rows, done, [members.index(int(one)) for one in accurate])
-        self._score_curves(label, rows, served, points, accuracy)
+        score_hindsight(rows, label, done, [members.index(int(one)) for one in accurate])
+        score_curves(rows, label, served, points, accuracy)
+        if curve:
+            self._score_chosen(found, label, rows, served, accuracy, curve=curve, limit=limit)
         return served
 
-    def _score_hindsight(
-        self, label: str, rows: Rows, done: Performance, accurate: Sequence[int]
-    ) -> None:
-        """What each group would get of its best member, and of its most accurate one."""
-        rolled, entry = done.episodes, (label, "")
-        returns = group_returns(rolled, self.groups)
-        halves = rolled[:, ::2], rolled[:, 1::2] if rolled.shape[1] > 1 else rolled
-        best = best_of_set(*(group_returns(half, self.groups) for half in halves))
-        for index, place in enumerate(accurate):
-            rows.add_return(entry, index, float(best[index]), prefix="best_")
-            rows.add_return(entry, index, float(returns[place, index]), prefix="accurate_")
-            if done.exact is not None:
-                own = done.exact[:, index]
-                rows.add_share(entry, index, float(own.max()), prefix="best_")
-                rows.add_share(entry, index, float(own[place]), prefix="accurate_")
-
-    def _score_curves(
+    def _score_chosen(
         self,
+        found: HypothesisSet,
         label: str,
         rows: Rows,
         served: Served,
-        points: Mapping[tuple[str, int], Tensor],
         accuracy: Tensor,
+        *,
+        curve: Sequence[int],
+        limit: int,
     ) -> None:
-        """What new raters are given after other numbers of answers."""
-        done = served.performance
-        returns = group_returns(done.episodes, self.groups)
-        for index in range(len(self.groups)):
-            for (method, answers), chosen in points.items():
-                entry = label, method
-                value = float(accuracy[chosen[index], index].mean())
-                rows.add_value(entry, index, f"accuracy@{answers}", value)
-                if not set(chosen.flatten().tolist()) <= set(served.members):
-                    continue
-                share = served.share(index, chosen)
-                value = rows.recovery(index, float(returns[:, index] @ share))
-                rows.add_value(entry, index, f"recovery@{answers}", value)
-                if done.exact is not None:
-                    value = float(done.exact[:, index] @ share.double())
-                    rows.add_share(entry, index, value, suffix=f"@{answers}")
+        """The same curves after questions that were chosen for each new rater."""
+        points = ask_new_raters(
+            found,
+            self.groups,
+            self.bank,
+            self.scores(found),
+            self.segment_utility,
+            raters=self.protocol.new_raters,
+            curve=curve,
+            pool=self.pool,
+            seed=self.seed,
+        )
+        wanted = to_roll([], points, limit=limit)
+        if not set(wanted) <= set(served.members):
+            done = self._perform(found.subset(wanted))
+            served = Served(served.picks, wanted, done, served.fair)
+        score_curves(rows, label, served, points, accuracy)
 
     def _score_as_a_whole(
         self,

@@ -53,6 +53,7 @@ METHODS = {
 CHOICES = {
     "": "",
     "posterior": " (catered)",
+    "information_gain": " (catered, questions chosen)",
     "lexicase": " (catered by lexicase)",
     "expectation": "",
     "risk_averse": ", risk-averse",

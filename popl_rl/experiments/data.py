@@ -33,6 +33,7 @@ __all__ = [
     "build_groups",
     "build_world",
     "describe",
+    "first_segments",
     "fresh_segments",
     "make_data",
 ]
@@ -283,6 +284,18 @@ def _check_segments(segments: TensorDictBase, path: Path, config: DataConfig, wo
             f"{path} holds observations of shape {tuple(segments[OBSERVATION].shape[2:])}, "
             f"but the environment gives {expected}; it was collected in another environment"
         )
+
+
+def first_segments(
+    config: DataConfig,
+    world: World,
+    *,
+    seed: int,
+    env: EnvConfig,
+    progress: Callable[[int], None] | None = None,
+) -> TensorDictBase:
+    """The segments that a run of this seed collects for training."""
+    return _collect(config, world, env, stream(seed, "segments"), progress)
 
 
 def fresh_segments(

@@ -5,6 +5,7 @@
   ``trunk_cache`` make it fast.
 * ``scoring``: scores of segments, margins of comparisons, values of cases.
 * ``preference_likelihood``, ``calibration``: how likely answers are, and how firm scores are.
+* ``questions``: which pair to ask a person about next.
 * ``hypothesis_set``, ``policy_set``, ``encoded_policy_set``, ``reward_set``: the result of
   training, catering to one person, one for all; ``sets`` makes and reads a set of any kind.
 * ``schedules``: learning rates.

@@ -13,9 +13,19 @@ from torch import Tensor
 
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
+from popl_rl.data.pairs import draw_pairs, starts_of
+from popl_rl.keys import ANSWER, PAIR, Answer
 from popl_rl.models.policies import PolicySpec, build_network
 from popl_rl.models.population import Population
 from popl_rl.models.preference_likelihood import MISTAKE, log_likelihood
+from popl_rl.models.questions import (
+    CANDIDATES,
+    ENOUGH,
+    RULES,
+    Behaviours,
+    Question,
+    best_question,
+)
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.models.scoring import case_values, margins
 from popl_rl.selection.lexicase import lexicase_selection
@@ -63,7 +73,7 @@ class HypothesisSet:
 
     def distinct(self, bank: SegmentBank, comparisons: Comparisons) -> Self:
         """Keep one member for each distinct row of passes ``[M]``, the first with that row."""
-        passes = self._margins(bank, comparisons) > 0
+        passes = self.margins(bank, comparisons) > 0
         inverse = torch.unique(passes, dim=0, return_inverse=True)[1].tolist()
         first = sorted({behaviour: inverse.index(behaviour) for behaviour in inverse}.values())
         return self.subset(first)
@@ -78,7 +88,7 @@ class HypothesisSet:
         p_i Z_ij p_j`` with equal shares p; two members are as similar as the agreement of their
         passes exceeds chance, ``Z = max(0, 2 agreement - 1)``.
         """
-        sign = (self._margins(bank, comparisons) > 0).float() * 2 - 1
+        sign = (self.margins(bank, comparisons) > 0).float() * 2 - 1
         similarity = (sign @ sign.T / sign.shape[1]).clamp(min=0)
         return float(1 / similarity.mean())
 
@@ -87,7 +97,8 @@ class HypothesisSet:
         """Segments as hypotheses of this kind read them."""
         return SegmentBank.from_segments(segments)
 
-    def _margins(self, segments: TensorDictBase | SegmentBank, comparisons: Comparisons) -> Tensor:
+    def margins(self, segments: TensorDictBase | SegmentBank, comparisons: Comparisons) -> Tensor:
+        """Margins of every hypothesis on every comparison, ``[N, M]``; positive is a pass."""
         bank = segments if isinstance(segments, SegmentBank) else self._bank(segments)
         pair = torch.stack([comparisons.preferred, comparisons.other])
         if pair.numel() < len(bank):
@@ -133,7 +144,7 @@ class HypothesisSet:
                 [0, 0.5) or ``generator`` is missing.
         """
         comparisons = Comparisons.from_preferences(answers, cases="preference")
-        margin = self._margins(segments, comparisons).cpu()
+        margin = self.margins(segments, comparisons).cpu()
         if method == "posterior":
             log_weight = log_likelihood(margin, mistake).sum(1)
             return Catered(int(log_weight.argmax()), log_weight.softmax(0))
@@ -143,6 +154,69 @@ class HypothesisSet:
             member = int(lexicase_selection(margin > 0, 1, generator=generator))
             return Catered(member, F.one_hot(torch.tensor(member), len(self)).float())
         raise ValueError(f"method must be 'posterior' or 'lexicase', got {method!r}")
+
+    def next_question(
+        self,
+        segments: TensorDictBase | SegmentBank,
+        answers: TensorDictBase | None = None,
+        *,
+        rule: str = "information_gain",
+        pairs: Tensor | None = None,
+        candidates: int = CANDIDATES,
+        enough: float = ENOUGH,
+        limit: int | None = None,
+        mistake: float = MISTAKE,
+        generator: torch.Generator | None = None,
+    ) -> Question | None:
+        """Choose what to ask one person next; see ``popl_rl.models.questions``.
+
+        Args:
+            segments: What may be asked about. Of a TensorDict with
+                ``popl_rl.keys.START``, only segments from the same start are compared.
+            answers: TensorDict ``[K]`` with ``pair`` and ``answer``, the person's so far; None or
+                empty for none. Nothing is asked twice, ties and skips included.
+            rule: ``"information_gain"``, ``"volume_removal"``, ``"expected_maximum"`` or
+                ``"uniform"``.
+            pairs: Candidates ``[P, 2]``; drawn uniformly if None.
+            candidates: How many to draw.
+            enough: Belief in one behaviour from which on nothing is asked; above 1 for never.
+            limit: Most questions in all; None for no limit.
+            mistake: Chance of a slip, as in ``cater``.
+            generator: Source of the candidates, and of uniform choices.
+
+        Returns:
+            The question; None where enough is known, ``limit`` questions were asked, or no
+            candidate is left.
+
+        Raises:
+            ValueError: If ``rule`` is unknown, ``pairs`` is empty or of another shape,
+                ``candidates`` is not positive, or ``generator`` is needed and missing.
+        """
+        if rule not in (*RULES, "uniform"):
+            raise ValueError(f"rule must be uniform, {', '.join(RULES)}, got {rule!r}")
+        asked = torch.empty(0, 2, dtype=torch.long) if answers is None else answers[PAIR].cpu()
+        if limit is not None and len(asked) >= limit:
+            return None
+        if pairs is None:
+            if candidates < 1:
+                raise ValueError(f"candidates must be at least 1, got {candidates}")
+            if generator is None:
+                raise ValueError("generator must be given to draw candidates; or pass pairs")
+            start = None if isinstance(segments, SegmentBank) else starts_of(segments)
+            pairs = draw_pairs(len(segments), candidates, start=start, generator=generator)
+        elif pairs.ndim != 2 or pairs.shape[1] != 2 or not len(pairs):
+            raise ValueError(f"pairs must have shape [P, 2] with P > 0, got {list(pairs.shape)}")
+        everything = Comparisons(pairs[:, 0], pairs[:, 1], torch.arange(len(pairs)), len(pairs))
+        margin = self.margins(segments, everything).cpu()
+        behaviours = Behaviours(margin, mistake=mistake)
+        weights = torch.full((len(self),), 1 / len(self))
+        if answers is not None and bool((answers[ANSWER] <= Answer.SECOND).any()):
+            weights = self.cater(segments, answers, mistake=mistake).weights
+        same = (pairs.sort(-1).values.unsqueeze(1) == asked.sort(-1).values).all(-1).any(-1)
+        if same.all() or float(behaviours.belief(weights).max()) >= enough:
+            return None
+        index, value = best_question(behaviours, weights, ~same, rule=rule, generator=generator)
+        return Question(pairs[index], value, weights)
 
     def fair(
         self,
@@ -168,7 +242,7 @@ class HypothesisSet:
         if not 0 <= quantile <= 1:
             raise ValueError(f"quantile must be in [0, 1], got {quantile}")
         comparisons = Comparisons.from_preferences(answers, cases="rater")
-        values = case_values(self._margins(segments, comparisons).cpu() > 0, comparisons)
+        values = case_values(self.margins(segments, comparisons).cpu() > 0, comparisons)
         return int(values.quantile(quantile, dim=1).argmax())
 
     def save(self, path: Path | str) -> None:

@@ -45,6 +45,22 @@ class StyledPopulation(Population):
         self.clone = clone
         self.members = TensorDictParams(TensorDict({"code": codes.clone()}, [len(codes)]))
 
+    @classmethod
+    def of_data(
+        cls, clone: StyleClone, count: int, *, generator: torch.Generator
+    ) -> "StyledPopulation":
+        """Members that fill the continuous code as the data do: a set over it to ask and cater by.
+
+        Weighing such members by answers is importance sampling of the belief over the code, with
+        the data's codes as the prior.
+
+        Args:
+            clone: What the codes are told to.
+            count: Members.
+            generator: Source of the codes.
+        """
+        return cls(clone, clone.draw(count, generator=generator))
+
     def layers(self) -> list[Layer]:
         """The clone's layers, shared by all members but for the first bias, ``[N, H]``."""
         seen, told, bias = self.clone.first_layer()

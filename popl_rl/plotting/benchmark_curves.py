@@ -27,7 +27,11 @@ from popl_rl.plotting.style import LEGEND, PALETTE, headline, tidy
 __all__ = ["catering_curves", "recovery_along_axes", "scenario_dots"]
 
 _LOWEST, _HIGHEST = -0.5, 1.25  # recoveries beyond are drawn at the edge
-_KINDS = {"posterior": "posterior catering", "lexicase": "lexicase catering"}
+_KINDS = {
+    "posterior": "posterior catering",
+    "information_gain": "posterior, questions chosen",
+    "lexicase": "lexicase catering",
+}
 
 
 def scenario_dots(suite: Suite, results: pd.DataFrame) -> Figure:
@@ -101,8 +105,9 @@ def catering_curves(suite: Suite, results: pd.DataFrame) -> Figure:
             ``recovery@10`` and ``best_recovery``.
 
     Returns:
-        A row of panels for each scenario, a panel for each kind of catering, a curve for each
-        method; to its right what the best member in hindsight would recover.
+        A row of panels for each scenario, a panel for each kind of catering that there is (to
+        questions that were drawn, or chosen by information gain), a curve for each method; to its
+        right what the best member in hindsight would recover.
 
     Raises:
         ValueError: If there are no curves.
@@ -117,6 +122,7 @@ def catering_curves(suite: Suite, results: pd.DataFrame) -> Figure:
     x = dict(zip(answers, np.log10(answers), strict=True))
     x[math.inf] = float(np.log10(answers[-1])) + 0.35
     styles = method_styles(suite, methods)
+    kinds = {choice: kind for choice, kind in _KINDS.items() if (table["choice"] == choice).any()}
     fig = Figure(figsize=(9.2, 1.9 * len(scenarios) + 1.6 + 0.2 * len(methods) / _columns_of(9.2)))
     headline(
         fig,
@@ -124,11 +130,11 @@ def catering_curves(suite: Suite, results: pd.DataFrame) -> Figure:
         f"{headline_name(table).capitalize()} of the worst-served group, with 95 % intervals over "
         "seeds.\nOn the right: of the best member in hindsight.",
     )
-    axes = fig.subplots(len(scenarios), 2, squeeze=False, sharex=True, sharey=True)
+    axes = fig.subplots(len(scenarios), len(kinds), squeeze=False, sharex=True, sharey=True)
     low = max(_LOWEST, min(0.0, float(table["value"].min())))
     for row, scenario in enumerate(scenarios):
         of_scenario = table[table["scenario"] == scenario]
-        for ax, (choice, kind) in zip(axes[row], _KINDS.items(), strict=True):
+        for ax, (choice, kind) in zip(axes[row], kinds.items(), strict=True):
             for method in methods:
                 chosen = of_scenario["method"] == method
                 rows = of_scenario[chosen & of_scenario["choice"].isin([choice, "best"])]

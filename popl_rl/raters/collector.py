@@ -8,9 +8,10 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Transform
 
+from popl_rl.data.pairs import starts_of
 from popl_rl.data.segments import stored_segments
 from popl_rl.keys import ANSWER, GROUP, PAIR, RATER, UTILITY, Answer
-from popl_rl.raters.pairs import PairPool, starts_of
+from popl_rl.raters.pairs import PairPool
 from popl_rl.raters.people import Raters
 from popl_rl.storage import load_tensordict
 

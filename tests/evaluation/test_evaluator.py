@@ -239,6 +239,21 @@ def test_curves_by_hand(curious, policies, baselines):
             assert "accuracy@20" not in found
 
 
+def test_curves_of_questions_that_were_chosen(curious, baselines):
+    """Of two opposite walkers one well-chosen answer finds a rater's own."""
+    board = curious.score(walkers(4.0, -4.0), baselines)
+    for group in ("likes_left", "likes_right"):
+        found = values(board, "popl", group, "information_gain")
+        measures = {
+            f"{name}@{answers}" for name in ("accuracy", "recovery") for answers in (1, 10, 25)
+        }
+        assert set(found) >= measures
+        assert all("@" in measure for measure in found)
+        best = board.value("popl", group, "best_accuracy", "posterior")
+        assert found["accuracy@1"] == pytest.approx(best)
+        assert found["recovery@1"] == pytest.approx(1, abs=0.05)
+
+
 def test_members_are_rolled_once_and_no_more_than_allowed(curious, baselines, monkeypatch):
     """Members 0 and 2 are the most accurate. Point 25 needs member 3 besides, point 1 member 4."""
     policies = walkers(4.0, 0.0, -4.0, 3.0, -3.0)

@@ -1,9 +1,11 @@
 import pytest
 import torch
+from tensordict import TensorDict
 
 from popl_rl.algorithms.losses import CPLLoss, cpl_loss
 from popl_rl.data.bank import SegmentBank
 from popl_rl.models.policies import PolicySpec
+from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.population import Population
 from popl_rl.models.scoring import segment_scores
 from popl_rl.models.style_codes import StyleClone, load_clone, save_clone, train_clone
@@ -154,3 +156,24 @@ def test_a_clone_without_weights_is_built_from_its_sizes():
     clone = StyleClone(SPEC, torch.zeros(4, 3))
     seen, told, bias = clone.first_layer()
     assert (seen.shape, told.shape, bias.shape) == ((16, 2), (16, 3), (16,))
+
+
+def test_questions_find_the_style_over_the_continuous_code(clone, bank):
+    """Somebody who likes weak actions is asked five questions over codes drawn from the data."""
+    generator = torch.Generator().manual_seed(0)
+    policies = PolicySet(StyledPopulation.of_data(clone, 64, generator=generator), alpha=0.5)
+    pairs, replies = [], []
+    for _ in range(5):
+        answers = None
+        if pairs:
+            said = {"pair": torch.stack(pairs), "answer": torch.tensor(replies)}
+            answers = TensorDict(said, [len(pairs)])
+        question = policies.next_question(bank, answers, enough=2.0, generator=generator)
+        pairs.append(question.pair)
+        first, second = question.pair.tolist()
+        replies.append(0 if first % 2 < second % 2 else 1 if second % 2 < first % 2 else 2)
+    said = {"pair": torch.stack(pairs), "answer": torch.tensor(replies)}
+    member = policies.cater(bank, TensorDict(said, [5])).member
+    seen = torch.tensor([[0.6, 1.0], [1.2, 1.0]])
+    action = policies.act(seen, member=member).squeeze(-1)
+    assert (action < 1.5 * seen[:, 0]).all(), "nearer to once than to twice the first coordinate"

@@ -93,6 +93,15 @@ def test_curves_of_catering_and_the_best_in_hindsight():
     assert_nothing_overlaps_the_edge(fig)
 
 
+def test_chosen_questions_have_a_panel_beside_drawn_ones():
+    asked = table(*curve_rows("plain", ("popl", "information_gain"), {1: 0.9, 10: 0.95}, None))
+    fig = catering_curves(SUITE, pd.concat([CURVES, asked]))
+    titles = [ax.get_title() for ax in fig.axes[:3]]
+    assert titles == ["posterior catering", "posterior, questions chosen", "lexicase catering"]
+    assert curves(fig.axes[1])[0] == pytest.approx(np.array([[0, 0.85], [1, 0.9]]))
+    assert_nothing_overlaps_the_edge(fig)
+
+
 def test_curves_need_curves():
     with pytest.raises(ValueError, match="measures such as recovery@10, got none"):
         catering_curves(SUITE, CURVES[CURVES.method == "pooled_cpl"])

@@ -5,11 +5,11 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
+from popl_rl.data.pairs import draw_pairs
 from popl_rl.data.segments import segment_buffer
 from popl_rl.keys import ANSWER, GROUP, PAIR, RATER, UTILITY, Answer
 from popl_rl.raters.collector import PreferenceCollector, collect_preferences, load_preferences
 from popl_rl.raters.groups import RaterGroup
-from popl_rl.raters.pairs import draw_pairs
 from popl_rl.raters.people import Raters
 from popl_rl.raters.response import Response
 from popl_rl.storage import save_tensordict

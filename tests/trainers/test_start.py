@@ -90,3 +90,34 @@ def test_a_benchmark_tells_a_wrong_setting_at_once(tmp_path, arguments, code, sa
     assert said in text
     assert found == code
     assert imported == []
+
+
+@pytest.mark.parametrize(
+    ("script", "arguments", "code", "said"),
+    [
+        ("label_pairs", ["--help"], 0, "raters_per_pair"),
+        ("label_pairs", ["out=x", "label.pairs=odd"], 2, "label.pairs must be uniform, start,"),
+        (
+            "label_pairs",
+            ["out=x", "label.pairs=disagreement"],
+            2,
+            "label.policies must be the",
+        ),
+        ("label_pairs", ["out=x", "page.prot=1"], 2, "prot"),
+        ("label_pairs", ["out=x", "data.load=nowhere"], 2, "data.load must be"),
+        ("serve_policies", ["--help"], 0, "candidates"),
+        ("serve_policies", ["run_dir=nowhere"], 2, "nowhere has no config.yaml"),
+        (
+            "serve_policies",
+            ["run_dir=x", "serve.questions=0"],
+            2,
+            "serve.questions must be",
+        ),
+    ],
+)
+def test_pages_tell_a_wrong_setting_at_once(tmp_path, script, arguments, code, said):
+    found, text, imported = start(*arguments, script=script, cwd=tmp_path)
+    assert said in text
+    assert found == code
+    assert imported == []
+    assert not (tmp_path / "x").exists()
