@@ -140,7 +140,7 @@ class VPL:
         rater = torch.randint(
             said.num_cases, (self.raters,), generator=source, device=self.problem.device
         )
-        mine = (said.case == rater.unsqueeze(1)).float()
+        mine = said.weighted((said.case == rater.unsqueeze(1)).float())
         index = torch.multinomial(mine, self.answers, replacement=True, generator=source)
         preferred, other = said.preferred[index], said.other[index]
         mean, log_std = self.encoder(self.problem.bank, preferred, other)
@@ -159,8 +159,10 @@ class VPL:
         wants = z[:, None, None].expand(*observation.shape[:-1], -1)
         output = self.network(torch.cat([observation, wants], -1))
         step = self.spec.step_scores(output, bank.action[segment])
-        time = torch.arange(step.shape[-1], device=step.device)
-        scores: Tensor = step @ (recipe.alpha * recipe.discount ** time.float())
+        weight = recipe.alpha * bank.weights(segment, discount=recipe.discount)
+        if weight.ndim > 1:
+            return (step * weight).sum(-1)
+        scores: Tensor = step @ weight
         return scores
 
     @torch.no_grad()

@@ -56,8 +56,11 @@ class AnswerEncoder(nn.Module):
         if self.spec.discrete:
             action = F.one_hot(action, self.spec.action_dim).float()
         steps = torch.cat([bank.observation[bank.row[segment]], action], -1)
-        embedded: Tensor = self.step(steps).relu().mean(-2)
-        return embedded
+        embedded: Tensor = self.step(steps).relu()
+        if bank.mask is None:
+            return embedded.mean(-2)
+        there = bank.mask[segment].unsqueeze(-1)
+        return (embedded * there).sum(-2) / there.sum(-2)
 
     def forward(self, bank: SegmentBank, preferred: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
         """The belief about raters.
