@@ -1,7 +1,7 @@
 """Settings, with their defaults and what they mean. Imports neither torch nor TorchRL.
 
 ``data``: environment, raters and segments; ``method``: methods, a section for each part;
-``evaluation``: how the result is evaluated; ``run``: a whole run; ``checks``: how they check
+``evaluation``: how the result is evaluated; ``people``: likewise, by held-out real people; ``run``: a whole run; ``checks``: how they check
 themselves; ``unread``: settings that the chosen method does not read.
 """
 
@@ -19,6 +19,7 @@ from popl_rl.config.method import (
     Training,
     VPLSettings,
 )
+from popl_rl.config.people import PeopleConfig
 from popl_rl.config.run import Config, EvaluateConfig, LoggerConfig, plain, validate
 from popl_rl.config.unread import unread
 
@@ -36,6 +37,7 @@ __all__ = [
     "MethodConfig",
     "MixtureSettings",
     "POPLSettings",
+    "PeopleConfig",
     "RatersConfig",
     "RefinementSettings",
     "ResponseConfig",

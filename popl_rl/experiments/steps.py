@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,6 +18,7 @@ from popl_rl.algorithms.trainer import MethodTrainer
 from popl_rl.config import Config, plain, validate
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.data.environments import World, build_world, indexed, is_stateless
+from popl_rl.data.readers.opening import open_data
 from popl_rl.evaluation.diagnostics import diagnostics
 from popl_rl.evaluation.evaluator import Evaluator
 from popl_rl.evaluation.results import Scoreboard
@@ -27,7 +29,7 @@ from popl_rl.experiments.builders import (
     build_spec,
     train_baselines,
 )
-from popl_rl.experiments.data import Data, Reader, build_groups, make_data
+from popl_rl.experiments.data import Data, build_groups, make_data
 from popl_rl.experiments.evaluators import make_evaluator
 from popl_rl.experiments.loggers import Progress, RunLogger, make_logger
 from popl_rl.experiments.metrics import MetricsWriter
@@ -44,7 +46,6 @@ from popl_rl.models.sets import as_set
 from popl_rl.models.style_population import StyledPopulation
 from popl_rl.randomness import stream
 from popl_rl.raters.groups import RaterGroup
-from popl_rl.registry import resolve
 from popl_rl.storage import write_atomic
 
 __all__ = [
@@ -127,8 +128,10 @@ def gather(config: Config, run_dir: Path) -> Setting:
     reader = None
     if load is None and config.data.load is not None:
         load = Path(config.data.load)
-        if config.data.reader is not None:
-            reader = cast("Reader", resolve("reader", config.data.reader))
+        if config.data.reader is not None or load.is_file():
+            reader = partial(
+                open_data, reader=config.data.reader, options=config.data.reader_options
+            )
     with Progress("segments", total=config.data.segments) as progress:
         data = make_data(
             config.data,
@@ -145,7 +148,11 @@ def gather(config: Config, run_dir: Path) -> Setting:
         data.save(kept)
     spec = build_spec(config.method, world.env)
     bank = spec.bank(indexed(data.steps, world.env.action_space)).to(config.device)
-    comparisons = Comparisons.from_preferences(data.preferences, cases=config.method.cases)
+    comparisons = Comparisons.from_preferences(
+        data.preferences,
+        cases=config.method.cases,
+        ties=config.method.ties,  # type: ignore[arg-type]
+    )
     clone, typical = None, None
     if config.method.evolve == "code" or config.evaluation.reference == "clone":
         with Progress("cloning", total=config.method.clone.steps) as progress:
