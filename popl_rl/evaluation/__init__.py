@@ -4,6 +4,8 @@
   ``ppo`` trains policies on reward functions, with episodes from ``ppo_episodes``.
 - What that is worth: ``measures`` of episodes and rankings, ``optimum`` with exact returns,
   ``best_of_set``, ``held_out_raters`` and ``ranking_agreement``.
+- Real people: ``people`` who are held out, ``people_models`` of each of them, and
+  ``people_statistics``.
 - What is told: ``evaluator`` fills the ``results`` of a run, ``diagnostics`` puts into words what
   stands out, ``statistics`` summarises groups and seeds, ``method_names`` says what methods are
   called, and ``suite`` what a benchmark compares.

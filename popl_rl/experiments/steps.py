@@ -59,6 +59,7 @@ __all__ = [
     "log_results",
     "open_logger",
     "open_run",
+    "save_anew",
     "train_references",
     "write_report",
 ]
@@ -166,7 +167,7 @@ def gather(config: Config, run_dir: Path) -> Setting:
             )
         alone = StyledPopulation(clone, clone.typical().unsqueeze(0))
         typical = as_set(alone, alpha=config.method.training.alpha)
-        _save_anew(typical, run_dir / "clone")
+        save_anew(typical, run_dir / "clone")
     comparisons = comparisons.to(config.device)
     problem = build_problem(config.method, spec, bank, comparisons, clone=clone)
     evaluator = make_evaluator(config, world, groups, data, spec, clone=typical, seed=config.seed)
@@ -216,7 +217,7 @@ def evolve(
         history.truncate_to(done)
         trainer.train()
     found = method.result()
-    _save_anew(found, run_dir / found.folder)
+    save_anew(found, run_dir / found.folder)
     return found
 
 
@@ -234,7 +235,7 @@ def train_references(config: Config, setting: Setting, run_dir: Path) -> Referen
                 generator=stream(config.seed, "baselines", config.device),
                 progress=progress.update,
             )
-        _save_anew(baselines, run_dir / "baselines")
+        save_anew(baselines, run_dir / "baselines")
     if options.reward_baselines and is_stateless(setting.world.env):
         rewards = train_reward_baselines(
             cast("RewardSpec", problem.spec),
@@ -324,7 +325,7 @@ def write_report(
     write_atomic(run_dir / "report.md", text)
 
 
-def _save_anew(found: HypothesisSet, path: Path) -> None:
+def save_anew(found: HypothesisSet, path: Path) -> None:
     """Save a set in the place of what a killed run may have left."""
     shutil.rmtree(path, ignore_errors=True)
     found.save(path)

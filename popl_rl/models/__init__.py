@@ -7,5 +7,5 @@
 * ``preference_likelihood``, ``calibration``: how likely answers are, and how firm scores are.
 * ``hypothesis_set``, ``policy_set``, ``encoded_policy_set``, ``reward_set``: the result of
   training, catering to one person, one for all; ``sets`` makes and reads a set of any kind.
-* ``schedules``: learning rates.
+* ``schedules``: learning rates; ``text_features``: what reward functions read of texts.
 """

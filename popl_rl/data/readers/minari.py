@@ -26,12 +26,12 @@ def minari_segments(path: Path, *, length: int | None = None) -> TensorDict:
         differ in length, ``mask``.
 
     Raises:
-        ImportError: If the package ``minari`` or ``h5py`` is missing.
-        ValueError: If observations are no vectors of numbers, or ``length`` is below 1.
+        ValueError: If the package ``minari`` or ``h5py`` is missing;
+            if observations are no vectors of numbers, or ``length`` is below 1.
     """
     if importlib.util.find_spec("minari") is None or importlib.util.find_spec("h5py") is None:
-        raise ImportError(
-            f"{path} is a Minari data set, which needs minari: pip install 'minari[hdf5]'"
+        raise ValueError(
+            f"{path} is a Minari data set, which needs the packages minari and h5py: pip install 'popl_rl[people]'"
         )
     if length is not None and length < 1:
         raise ValueError(f"length must be at least 1 or None, got {length}")

@@ -1,0 +1,413 @@
+"""Learning from real people's answers, and judging by people who were held out."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from typing import Any, cast
+
+import pandas as pd
+import torch
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from popl_rl.algorithms.cpl import GroupCPL, train
+from popl_rl.algorithms.expectation import expect
+from popl_rl.algorithms.problem import Method, Problem
+from popl_rl.algorithms.vpl import VPL
+from popl_rl.config import Config, MethodConfig, PeopleConfig
+from popl_rl.data.bank import SegmentBank
+from popl_rl.data.comparisons import Comparisons
+from popl_rl.data.readers.imported import Imported
+from popl_rl.evaluation.people import Predictor, Questions, SetPredictor, draw_questions, judge
+from popl_rl.evaluation.people_models import EncodedPredictor, IndividualPredictor
+from popl_rl.evaluation.people_statistics import PERSON_COLUMNS
+from popl_rl.experiments.builders import build_method, build_problem
+from popl_rl.keys import ACTION, ANSWER, CONDITION, OBSERVATION, RATER, Answer
+from popl_rl.models.calibration import SCALES
+from popl_rl.models.hypothesis_set import HypothesisSet
+from popl_rl.models.policies import PolicySpec
+from popl_rl.models.population import Population
+from popl_rl.models.preference_likelihood import log_likelihood, per_case
+from popl_rl.models.reward_functions import RewardSpec
+from popl_rl.models.scoring import margins
+from popl_rl.randomness import stream
+
+__all__ = ["Fold", "People", "Trained", "judge_fold", "method_config", "people_of", "split", "train_on"]
+
+_E_STEPS = 30  # of the shares of a finished set's members
+
+
+@dataclass(frozen=True)
+class People:
+    """Real people's answers, ready to learn from and to judge by.
+
+    Attributes:
+        spec: Sizes of the hypotheses.
+        bank: Segments.
+        data: What was read.
+        answers: Strict answers of all, a case for each person; what questions refer to.
+        names: Name of each person, and of everybody unknown ``?``, ``[C]``.
+        groups: Condition of each person, if a column said so; empty text elsewhere, ``[C]``.
+    """
+
+    spec: PolicySpec | RewardSpec
+    bank: SegmentBank
+    data: Imported
+    answers: Comparisons
+    names: list[str]
+    groups: list[str]
+
+    @property
+    def known(self) -> Tensor:
+        """Which persons are known by an id, ``[C]`` bool."""
+        return torch.tensor([name != "?" for name in self.names])
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Who is learnt from and who judges.
+
+    Attributes:
+        number: Which fold it is.
+        held_out: Persons who judge.
+        training: Answers to learn from, with soft labels and ties if these count.
+        validation: Answers by which scales and numbers are chosen; their people are in neither.
+    """
+
+    number: int
+    held_out: list[int]
+    training: Comparisons
+    validation: Comparisons
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What a method found on a fold.
+
+    Attributes:
+        label: Name of the method.
+        predictors: What predicts new people's answers, by the choice it makes.
+        found: The set, if there is one.
+    """
+
+    label: str
+    predictors: dict[str, Predictor]
+    found: HypothesisSet | None = None
+
+
+def people_of(data: Imported, config: MethodConfig) -> People:
+    """Read off what can be learnt from people's answers.
+
+    Args:
+        data: Segments, preferences, names.
+        config: What hypotheses are, and their hidden layers.
+
+    Raises:
+        ValueError: If nothing is known of what is compared, or nobody kept rater ids.
+    """
+    segments, preferences, names = data
+    width, action = segments[OBSERVATION].shape[-1], segments[ACTION]
+    if not width:
+        raise ValueError(
+            "the items have no features; import them with encode=tfidf or encode=<model folder>"
+        )
+    if RATER not in preferences.keys():  # noqa: SIM118 - not a dict
+        raise ValueError(
+            "the answers carry no rater ids, and only people whose answers are known to be theirs "
+            "can be held out; add a column 'rater', or name groups to simulate (raters=...)"
+        )
+    discrete = not action.is_floating_point()
+    sizes = int(action.max()) + 1 if discrete else action.shape[-1]
+    spec: PolicySpec | RewardSpec = PolicySpec(width, sizes, discrete, tuple(config.hidden))
+    if config.learns == "reward" or (discrete and sizes == 1):
+        inputs, outputs = (width, sizes) if discrete else (width + sizes, 1)
+        spec = RewardSpec(inputs, outputs, tuple(config.hidden))
+    answers = Comparisons.from_preferences(preferences, cases="rater")
+    strict = preferences[ANSWER] <= Answer.SECOND
+    who = preferences[RATER][strict]
+    named = names.raters or [str(number) for number in range(int(who.max()) + 1)]
+    first = torch.full((answers.num_cases,), len(who)).scatter_reduce(
+        0, answers.case, torch.arange(len(who)), "amin"
+    )
+    person = ["?" if code < 0 else named[code] for code in who[first].tolist()]
+    groups = [""] * len(person)
+    if CONDITION in preferences.keys(True):
+        codes = preferences[CONDITION][strict][first].tolist()
+        groups = [
+            "" if code < 0 else names.conditions[code] if names.conditions else str(code)
+            for code in codes
+        ]
+    return People(spec, spec.bank(segments), data, answers, person, groups)
+
+
+def split(people: People, config: PeopleConfig, number: int, *, ties: str, seed: int) -> Fold:
+    """Hold some people out, and of the others some to choose scales by.
+
+    Args:
+        people: Everybody.
+        config: How many folds, and who can be held out.
+        number: Which fold, from 0.
+        ties: Whether ties and soft labels count in training, see
+            :meth:`~popl_rl.data.comparisons.Comparisons.from_preferences`.
+        seed: Seed of the folds.
+
+    Raises:
+        ValueError: If there are fewer people with enough answers than folds.
+    """
+    size = people.answers.sizes()
+    able = (people.known & (size >= config.least)).nonzero()[:, 0]
+    if len(able) < config.folds:
+        raise ValueError(
+            f"people.folds={config.folds} needs as many people with {config.least} strict answers "
+            f"(people.least) or more, got {len(able)}; lower either"
+        )
+    able = able[torch.randperm(len(able), generator=stream(seed, "folds of people"))]
+    held_out = able[number :: config.folds].sort().values
+    others = torch.ones(people.answers.num_cases, dtype=torch.bool)
+    others[held_out] = False
+    rest = others.nonzero()[:, 0]
+    rest = rest[torch.randperm(len(rest), generator=stream(seed, f"validation people/{number}"))]
+    chosen = torch.zeros_like(others)
+    chosen[rest[: max(1, round(config.validation * len(rest)))]] = True
+    everything = Comparisons.from_preferences(
+        people.data.preferences, cases="rater", ties=cast("Any", ties)
+    )
+    # Cases of people with ties alone have no number among the strict answers.
+    learnt = _of_people(everything, people, others & ~chosen) if ties == "count" else None
+    training = learnt or _some(people.answers, others & ~chosen)
+    return Fold(number, held_out.tolist(), training, _some(people.answers, chosen))
+
+
+def _some(answers: Comparisons, chosen: Tensor) -> Comparisons:
+    """Answers of some cases, which are numbered anew."""
+    kept = answers.rows(chosen[answers.case].nonzero()[:, 0])
+    case = kept.case.unique(return_inverse=True)[1]
+    return replace(kept, case=case, num_cases=int(case.max()) + 1)
+
+
+def _of_people(everything: Comparisons, people: People, chosen: Tensor) -> Comparisons:
+    """The same people's answers with ties and soft labels."""
+    preferences = people.data.preferences
+    strict = preferences[ANSWER] <= Answer.SECOND
+    counted = preferences[ANSWER] <= Answer.TIE
+    # Both number the same raters, each from 0 and in the same order, unknown ones behind.
+    known = preferences[RATER] >= 0
+    among = preferences[RATER][counted & known].unique()
+    there = preferences[RATER][strict & known].unique()
+    allowed = torch.zeros(everything.num_cases, dtype=torch.bool)
+    allowed[: len(among)] = True
+    place = torch.searchsorted(among, there)
+    allowed[place] = chosen[: len(there)]
+    # Whoever is unknown may be learnt from unless chosen to validate; of these, strict answers
+    # come in the same order.
+    unknown = preferences[RATER][counted] < 0
+    is_strict = (preferences[ANSWER][counted] <= Answer.SECOND)[unknown]
+    rest = torch.ones(len(is_strict), dtype=torch.bool)
+    rest[is_strict] = chosen[len(there) :]
+    allowed[len(among) :] = rest
+    return _some(everything, allowed)
+
+
+def method_config(config: MethodConfig, name: str) -> MethodConfig:
+    """Settings of another method, all else as they are.
+
+    Args:
+        config: Settings of the run.
+        name: A file of ``configs/method``, or the run's own method.
+
+    Raises:
+        ValueError: If there is none of this name.
+    """
+    if name == config.name:
+        return config
+    entry = files("popl_rl.configs.method") / f"{name}.yaml"
+    if not entry.is_file():
+        folder = files("popl_rl.configs.method")
+        known = sorted(
+            each.name.removesuffix(".yaml")
+            for each in folder.iterdir()
+            if each.name.endswith(".yaml")
+        )
+        raise ValueError(f"people.methods must be of {', '.join(known)}, got {name!r}")
+    base = MethodConfig(
+        cases=config.cases,
+        ties=config.ties,
+        learns=config.learns,
+        hidden=config.hidden,
+        members=config.members,
+        generations=config.generations,
+        training=config.training,
+        refinement=config.refinement,
+    )
+    merged = OmegaConf.merge(
+        OmegaConf.structured(base), OmegaConf.create(entry.read_text(encoding="utf-8"))
+    )
+    return cast("MethodConfig", OmegaConf.to_object(merged))
+
+
+def train_on(
+    people: People,
+    fold: Fold,
+    config: Config,
+    name: str,
+    *,
+    run: Callable[[Method], HypothesisSet] = train,
+) -> Trained:
+    """Train a method on a fold, choose its scale, and make it predict.
+
+    Args:
+        people: Everybody.
+        fold: Whom to learn from.
+        config: Settings of the run.
+        name: ``pooled_cpl``, ``individual``, or a method of ``configs/method``.
+        run: Runs a method to its end.
+    """
+    settings = method_config(config.method, config.method.name if name in _SINGLE else name)
+    problem = build_problem(settings, people.spec, people.bank, fold.training)
+    generator = stream(config.seed, f"people/{fold.number}/{name}")
+    if name in _SINGLE:
+        weight = torch.ones(1, len(fold.training))
+        pooled = run(GroupCPL(problem, weight=weight, generator=generator))
+        scale = _scale(_margins(pooled, people, fold.validation), fold.validation)
+        if name == "pooled_cpl":
+            pooled.alpha *= scale
+            predictor = SetPredictor(_margins(pooled, people, people.answers))
+            return Trained(name, {"": predictor}, pooled)
+        own = IndividualPredictor(
+            problem,
+            people.answers,
+            pooled.population,
+            steps=config.people.individual_steps,
+            scale=scale,
+            seed=config.seed,
+        )
+        return Trained(name, {"": own})
+    if name == "em" and settings.em.groups is None:
+        return _best_em(people, fold, config, settings, problem, generator, run)
+    method = build_method(settings, problem, num_groups=2, generator=generator)
+    found = run(method)
+    if isinstance(method, VPL):
+        encoded = EncodedPredictor(method, fold.validation)
+        validation = _all_questions(fold.validation)
+        most = int(validation.told.max())
+        margin = encoded.margins(validation, most)[validation.mask]
+        scale = _scale_of_margins(margin)
+        return Trained(
+            name, {"encoder": EncodedPredictor(method, people.answers, scale=scale)}, found
+        )
+    return _as_trained(name, found, people, fold)
+
+
+_SINGLE = ("pooled_cpl", "individual")
+
+
+def _margins(found: HypothesisSet, people: People, comparisons: Comparisons) -> Tensor:
+    return margins(
+        found.population, people.bank, comparisons, alpha=found.alpha, discount=found.discount
+    )
+
+
+def _shares(margin: Tensor, comparisons: Comparisons) -> Tensor:
+    """Shares of the people whom each member speaks for, by EM with the members as they are."""
+    likelihood = per_case(log_likelihood(margin), comparisons)
+    share = torch.full((len(margin),), 1 / len(margin))
+    for _ in range(_E_STEPS):
+        share = expect(likelihood, share).responsibility.mean(1)
+    return share
+
+
+def _scale_of_margins(margin: Tensor) -> float:
+    each = torch.stack([log_likelihood(scale * margin).mean() for scale in SCALES])
+    return SCALES[int(each.argmax())]
+
+
+def _scale(margin: Tensor, comparisons: Comparisons) -> float:
+    """Scale under which the mixture of the members explains people's answers best."""
+    each = []
+    for scale in SCALES:
+        share = _shares(scale * margin, comparisons)
+        likelihood = per_case(log_likelihood(scale * margin), comparisons)
+        each.append(expect(likelihood, share).evidence.mean())
+    return SCALES[int(torch.stack(each).argmax())]
+
+
+def _as_trained(name: str, found: HypothesisSet, people: People, fold: Fold) -> Trained:
+    """A set that is catered, that mixes, and of which one serves all."""
+    found.alpha *= _scale(_margins(found, people, fold.validation), fold.validation)
+    learnt = _margins(found, people, fold.training)
+    prior = _shares(learnt, fold.training).clamp(min=1e-3).log()
+    margin = _margins(found, people, people.answers)
+    best = int(fold.training.weighted(log_likelihood(learnt)).sum(1).argmax())
+    predictors: dict[str, Predictor] = {
+        "posterior": SetPredictor(margin, log_prior=prior),
+        "mixture": SetPredictor(margin, log_prior=prior, mix=True),
+        "single": SetPredictor(margin[[best]]),
+    }
+    return Trained(name, predictors, found)
+
+
+def _best_em(
+    people: People,
+    fold: Fold,
+    config: Config,
+    settings: MethodConfig,
+    problem: Problem,
+    generator: torch.Generator,
+    run: Callable[[Method], HypothesisSet],
+) -> Trained:
+    """EM with the number of groups under which the validation people's answers are likeliest."""
+    best, most = None, -float("inf")
+    for groups in range(1, config.people.most_groups + 1):
+        told = replace(settings, em=replace(settings.em, groups=groups))
+        method = build_method(told, problem, num_groups=groups, generator=generator)
+        found = run(method)
+        margin = _margins(found, people, fold.validation)
+        margin = _scale(margin, fold.validation) * margin
+        share = _shares(_margins(found, people, fold.training), fold.training)
+        likelihood = per_case(log_likelihood(margin), fold.validation)
+        value = float(expect(likelihood, share).evidence.mean())
+        if value > most:
+            best, most = found, value
+    assert best is not None
+    return _as_trained("em", best, people, fold)
+
+
+def _all_questions(answers: Comparisons) -> Questions:
+    """Questions of everybody with two answers or more, for scales."""
+    able = (answers.sizes() >= 2).nonzero()[:, 0].tolist()
+    return draw_questions(answers, able, generator=torch.Generator().manual_seed(0))
+
+
+def judge_fold(
+    people: People, fold: Fold, trained: Trained, config: PeopleConfig, *, seed: int
+) -> pd.DataFrame:
+    """How well the held-out people's further answers are predicted.
+
+    Args:
+        people: Everybody.
+        fold: Who is held out.
+        trained: What was learnt from the others.
+        config: Numbers of answers that are told.
+        seed: Seed of the division of their answers, the same for every method.
+
+    Returns:
+        Rows with the columns :data:`~popl_rl.evaluation.people_statistics.PERSON_COLUMNS`.
+    """
+    curve: Sequence[int] = sorted(set(config.curve))
+    questions = draw_questions(
+        people.answers,
+        fold.held_out,
+        most=max(*curve, 1),
+        repeats=config.repeats,
+        generator=stream(seed, f"held-out people/{fold.number}"),
+    )
+    rows = []
+    for choice, predictor in trained.predictors.items():
+        for answers in curve:
+            found = judge(predictor, questions, answers=answers)
+            for case, accuracy, likely in zip(*(each.tolist() for each in found), strict=True):
+                who = people.names[case], people.groups[case]
+                rows.append(
+                    (trained.label, choice, fold.number, *who, answers, accuracy, likely)
+                )
+    return pd.DataFrame(rows, columns=PERSON_COLUMNS)
