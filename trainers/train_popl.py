@@ -104,9 +104,8 @@ def show(result: Result) -> None:
     from rich.console import Console
 
     from popl_rl.evaluation.diagnostics import alarm
-    from popl_rl.experiments.report import results_table
-
     from popl_rl.experiments.people_report import people_alarm, people_table
+    from popl_rl.experiments.report import results_table
 
     console = Console()
     results = result.board.results

@@ -186,7 +186,5 @@ def judge(
     values = [(each * questions.mask).sum(1) / size for each in (right.float(), likely)]
     people, place = questions.person[enough].unique(return_inverse=True)
     count = place.bincount(minlength=len(people)).clamp(min=1)
-    means = [
-        torch.zeros(len(people)).index_add_(0, place, each[enough]) / count for each in values
-    ]
+    means = [torch.zeros(len(people)).index_add_(0, place, each[enough]) / count for each in values]
     return people, means[0], means[1]

@@ -49,7 +49,9 @@ def paired_bootstrap(
     means = np.empty(samples)
     for start in range(0, samples, 200):  # a matrix of all would not fit with many people
         size = (min(200, samples - start), len(difference))
-        means[start : start + 200] = difference[generator.integers(len(difference), size=size)].mean(1)
+        means[start : start + 200] = difference[
+            generator.integers(len(difference), size=size)
+        ].mean(1)
     low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
     return mean, float(low), float(high)
 
@@ -140,9 +142,7 @@ def _alone(table: pd.DataFrame, seed: int) -> dict[str, float]:
     return found
 
 
-def _beside(
-    table: pd.DataFrame, other: pd.DataFrame, name: str, seed: int
-) -> Mapping[str, float]:
+def _beside(table: pd.DataFrame, other: pd.DataFrame, name: str, seed: int) -> Mapping[str, float]:
     both = table.join(other, how="inner", rsuffix="_other")
     ours, theirs = both["accuracy"].to_numpy(float), both["accuracy_other"].to_numpy(float)
     found = {}

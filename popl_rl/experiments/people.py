@@ -26,13 +26,21 @@ from popl_rl.keys import ACTION, ANSWER, CONDITION, OBSERVATION, RATER, Answer
 from popl_rl.models.calibration import SCALES
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.policies import PolicySpec
-from popl_rl.models.population import Population
 from popl_rl.models.preference_likelihood import log_likelihood, per_case
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.models.scoring import margins
 from popl_rl.randomness import stream
 
-__all__ = ["Fold", "People", "Trained", "judge_fold", "method_config", "people_of", "split", "train_on"]
+__all__ = [
+    "Fold",
+    "People",
+    "Trained",
+    "judge_fold",
+    "method_config",
+    "people_of",
+    "split",
+    "train_on",
+]
 
 _E_STEPS = 30  # of the shares of a finished set's members
 
@@ -407,7 +415,5 @@ def judge_fold(
             found = judge(predictor, questions, answers=answers)
             for case, accuracy, likely in zip(*(each.tolist() for each in found), strict=True):
                 who = people.names[case], people.groups[case]
-                rows.append(
-                    (trained.label, choice, fold.number, *who, answers, accuracy, likely)
-                )
+                rows.append((trained.label, choice, fold.number, *who, answers, accuracy, likely))
     return pd.DataFrame(rows, columns=PERSON_COLUMNS)

@@ -21,6 +21,7 @@ def read_chosen(
     features: str | None = None,
     rater: str = "rater",
     condition: str = "condition",
+    drop_equal: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> Imported:
     """Read texts in pairs of which the first was chosen.
@@ -36,6 +37,7 @@ def read_chosen(
             the texts are encoded.
         rater: Column of who chose; need not be there.
         condition: Column of a group or condition; likewise, and never read by a learner.
+        drop_equal: Leave out rows whose two texts are the same.
         progress: Called with the number of rows read so far.
 
     Raises:
@@ -56,7 +58,12 @@ def read_chosen(
             problems.add(piece[name].isna(), f"the column {name!r} is empty", start=start)
         prompt = piece["prompt"].map(_text) if "prompt" in piece else pd.Series("", piece.index)
         both = [_with_prompt(prompt, piece[name].map(_text)) for name in ("chosen", "rejected")]
-        problems.add(both[0] == both[1], "both texts are the same", start=start)
+        same = both[0] == both[1]
+        if drop_equal:
+            piece, both = piece[~same], [side[~same] for side in both]
+        else:
+            cure = "both texts are the same; leave such rows out with drop_equal=true"
+            problems.add(same, cure, start=start)
         sides.append(np.stack([side.to_numpy(object) for side in both], 1))
         kept.append(piece[[name for name in (rater, condition) if name in piece]])
     problems.check()

@@ -89,7 +89,7 @@ def _pieces(path: Path, kind: str) -> Iterator[pd.DataFrame]:
         return
     options: dict[str, Any] = {"chunksize": _PIECE, "encoding": "utf-8"}
     if kind == "jsonl":
-        with pd.read_json(path, lines=True, dtype=False, convert_dates=False, **options) as pieces:
+        with pd.read_json(path, lines=True, dtype=False, **options) as pieces:
             yield from pieces
         return
     # Ids such as 007 stay as they are written.

@@ -17,10 +17,10 @@ class Names(NamedTuple):
         texts: Text of each segment, where segments are texts.
     """
 
-    items: list[str] = []  # noqa: RUF012 - never changed in place
-    raters: list[str] = []  # noqa: RUF012
-    conditions: list[str] = []  # noqa: RUF012
-    texts: list[str] = []  # noqa: RUF012
+    items: list[str] = []
+    raters: list[str] = []
+    conditions: list[str] = []
+    texts: list[str] = []
 
 
 class Imported(NamedTuple):

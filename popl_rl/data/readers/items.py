@@ -31,7 +31,7 @@ class Items(NamedTuple):
 
     segments: TensorDictBase
     ids: list[str]
-    texts: list[str] = []  # noqa: RUF012 - never changed in place
+    texts: list[str] = []
 
 
 def features_as_segments(features: npt.NDArray[np.float32]) -> TensorDict:
@@ -152,9 +152,7 @@ def _ids(table: pd.DataFrame, problems: Problems, path: Path) -> list[str]:
     return table[name].astype(str).tolist()
 
 
-def _numbers(
-    table: pd.DataFrame, problems: Problems, *, strict: bool
-) -> npt.NDArray[np.float32]:
+def _numbers(table: pd.DataFrame, problems: Problems, *, strict: bool) -> npt.NDArray[np.float32]:
     """Numeric columns ``[N, F]``; others are a problem if ``strict``, else left out."""
     columns = []
     for name in table:

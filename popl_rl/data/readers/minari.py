@@ -31,7 +31,8 @@ def minari_segments(path: Path, *, length: int | None = None) -> TensorDict:
     """
     if importlib.util.find_spec("minari") is None or importlib.util.find_spec("h5py") is None:
         raise ValueError(
-            f"{path} is a Minari data set, which needs the packages minari and h5py: pip install 'popl_rl[people]'"
+            f"{path} is a Minari data set, which needs the packages minari and h5py: "
+            "pip install 'popl_rl[people]'"
         )
     if length is not None and length < 1:
         raise ValueError(f"length must be at least 1 or None, got {length}")

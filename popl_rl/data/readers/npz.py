@@ -26,17 +26,15 @@ _FORMS = (
 )
 
 
-def read_npz(
-    path: Path, *, score: str | None = None, one_sided: bool = False
-) -> Imported:
+def read_npz(path: Path, *, score: str | None = None, one_sided: bool = False) -> Imported:
     """Read segments and preferences from an npz file.
 
     Three forms are known. (1) ``obs``, ``action`` ``[N, T, ...]``, ``pair`` ``[M, 2]`` and
     ``answer`` ``[M]``. (2) ``obs``, ``action`` and a number for each segment, as CPL (arXiv
     2310.13639) publishes: segments 2i and 2i + 1 are compared, the larger number is preferred, and
     equal ones are ties. (3) CPL's older ``obs_1 obs_2 action_1 action_2`` with ``label``, 1 (or
-    near it) where the second is preferred. ``rater``, ``condition`` ``[M]`` and ``mask`` ``[N, T]``
-    may be there.
+    near it) where the second is preferred. ``rater``, ``condition``, ``chance`` (soft labels beside codes) ``[M]`` and
+    ``mask`` ``[N, T]`` may be there.
 
     Args:
         path: The file.
@@ -157,7 +155,9 @@ def _answers(
         if label.shape != (len(pair),):
             problems.add_text(f"labels must have shape [{len(pair)}], got {list(label.shape)}")
             problems.check()
-        return read_answers(pd.Series(label), problems)
+        code, chance = read_answers(pd.Series(label), problems)
+        soft = arrays.get("chance")
+        return code, chance if soft is None else np.asarray(soft, np.float32)
     names = ("rl_sum", "reward_sum", "rl_dir", "score") if score is None else (score,)
     value = np.asarray(_need(arrays, names, problems.path), float)
     while value.ndim > 1:
@@ -175,5 +175,5 @@ def _column(arrays: dict[str, Any], name: str, count: int, path: Path) -> pd.Ser
     if values.shape != (count,):
         raise ValueError(f"{path}: {name!r} must have shape [{count}], got {list(values.shape)}")
     column = pd.Series(values)
-    # -1 is how numbers say that somebody is unknown.
-    return column.where(column != -1) if values.dtype.kind in "iu" else column
+    # How arrays, which know no missing values, say that somebody is unknown.
+    return column.where(column != (-1 if values.dtype.kind in "iu" else ""))

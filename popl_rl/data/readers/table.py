@@ -1,6 +1,6 @@
 """Comparisons in a table (csv, jsonl, parquet), beside a table of what is compared."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from popl_rl.data.readers.answers import read_answers
 from popl_rl.data.readers.files import first_row, read_pieces
 from popl_rl.data.readers.imported import Imported, Names
 from popl_rl.data.readers.items import Items, read_items, read_segments
-from popl_rl.data.readers.problems import Problems, listed
+from popl_rl.data.readers.problems import Problems
 from popl_rl.keys import ANSWER, CHANCE, CONDITION, PAIR, RATER, Answer
 
 __all__ = ["check_sides", "preferences_of", "read_table"]
@@ -72,7 +72,7 @@ def read_table(
         things = read_segments(Path(str(segments)), length=length)
     columns = {"first": first, "second": second, "answer": answer}
     pieces = list(_pieces(path, columns, (rater, condition), things, progress))
-    if not pieces:
+    if not sum(len(piece[0]) for piece in pieces):
         raise ValueError(f"{path} holds no comparisons, only a header")
     pair = np.concatenate([piece[0] for piece in pieces])
     said = pd.concat([piece[1] for piece in pieces], ignore_index=True)
@@ -94,7 +94,8 @@ def _pieces(
     optional: tuple[str, str],
     things: Items,
     progress: Callable[[int], None] | None,
-):  # type: ignore[no-untyped-def]
+) -> Iterator[tuple[npt.NDArray[np.int64], pd.DataFrame]]:
+    """Rows of the two items of each comparison, and what was said, piece by piece."""
     index = pd.Index(things.ids)
     problems = Problems(path, first=first_row(path))
     for piece in read_pieces(path, progress=progress):

@@ -114,7 +114,7 @@ def write_npz(data: Imported, path: Path) -> None:
         "answer": preferences[ANSWER].numpy(),
     }
     if CHANCE in preferences.keys():  # noqa: SIM118 - not a dict
-        arrays["answer"] = preferences[CHANCE].numpy()
+        arrays["chance"] = preferences[CHANCE].numpy()
     arrays |= {
         str(key): segments[key].numpy()
         for key in (MASK, REWARD)
@@ -134,9 +134,7 @@ def write_npz(data: Imported, path: Path) -> None:
 
 def _named(number: torch.Tensor, names: list[str]) -> list[str]:
     """Names of raters or conditions; empty text where unknown."""
-    return [
-        "" if code < 0 else names[code] if names else str(code) for code in number.tolist()
-    ]
+    return ["" if code < 0 else names[code] if names else str(code) for code in number.tolist()]
 
 
 def _answers(preferences: TensorDict) -> list[object]:
