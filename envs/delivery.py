@@ -1,7 +1,7 @@
 """A delivery grid whose board is a file: a van drives past coins, mud and sheep to a goal.
 
-The board of a study in which people compared short segments (arXiv 2501.06416) is of this form; with
-such a file the preferences of its participants can be learnt from and policies judged exactly.
+The board of a study in which people compared short segments (arXiv 2501.06416) is of this form;
+with such a file the preferences of its participants can be learnt from and policies judged exactly.
 """
 
 from pathlib import Path
@@ -74,11 +74,9 @@ class DeliveryGrid(gymnasium.Env[Any, Any]):
         self.open = (~ends & (self.kind != _HOUSE)).ravel()
         if start is not None and not self.open[start[0] * columns + start[1]]:
             raise ValueError(f"start must be a cell that one can drive from, got {tuple(start)}")
-        self.starts = (
-            np.flatnonzero(self.open)
-            if start is None
-            else np.array([start[0] * columns + start[1]])
-        )
+        self.starts = np.flatnonzero(self.open)
+        if start is not None:
+            self.starts = np.array([start[0] * columns + start[1]])
         self.max_steps = max_steps
         self.observation_space = gymnasium.spaces.Box(0, 1, (self.cells,), np.float32)
         self.action_space = gymnasium.spaces.Discrete(self.actions)
@@ -107,7 +105,8 @@ class DeliveryGrid(gymnasium.Env[Any, Any]):
 
     def observe(self, cell: NDArray[Any] | int) -> NDArray[np.float32]:
         """Observations of cells ``[...]``, ``[..., cells]``."""
-        return np.eye(self.cells, dtype=np.float32)[cell]
+        seen: NDArray[np.float32] = np.eye(self.cells, dtype=np.float32)[cell]
+        return seen
 
     def walk(
         self, start: NDArray[Any], action: NDArray[Any]

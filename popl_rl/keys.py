@@ -21,7 +21,7 @@ Preferences, batch size ``[M]``:
 | ``chance`` | ``[M]`` | float32 | optional soft label: how likely the second is preferred |
 | ``("hidden", "group")`` | ``[M]`` | int64 | group of that person. For evaluation only |
 | ``("hidden", "utility")`` | ``[M, 2]`` | float32 | utility of each segment. For evaluation only |
-| ``("hidden", "condition")`` | ``[M]`` | int64 | what real people were told to look at. For evaluation only |
+| ``("hidden", "condition")`` | ``[M]`` | int64 | what people were told. For evaluation only |
 """
 
 from enum import IntEnum

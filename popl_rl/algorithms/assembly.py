@@ -107,8 +107,8 @@ def _gradient(
         learning_rate=problem.training.learning_rate / 2,
         generator=generator,
     )
-    # It has not been tried for heads and reward functions.
-    tried = problem.evolve == "all" and problem.spec.refines
+    # It has not been tried for heads, and for reward functions with real people alone.
+    tried = problem.evolve == "all" and (problem.spec.refines or refinement.rewards)
     return POPL(
         problem,
         population=population,

@@ -98,7 +98,7 @@ class VPL:
         if not vpl.kl >= 0:
             raise ValueError(f"vpl.kl must be at least 0, got {vpl.kl}")
         self.problem, self.spec = problem, problem.spec
-        self.kl, self.answers = vpl.kl, vpl.answers
+        self.kl, self.answers, self.latent = vpl.kl, vpl.answers, vpl.latent
         self.raters = max(1, problem.training.batch_size // vpl.answers)
         self.generator = generator
         self.generation, self.generations = 0, problem.generations

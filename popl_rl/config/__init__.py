@@ -1,8 +1,9 @@
 """Settings, with their defaults and what they mean. Imports neither torch nor TorchRL.
 
 ``data``: environment, raters and segments; ``method``: methods, a section for each part;
-``evaluation``: how the result is evaluated; ``people``: likewise, by held-out real people; ``run``: a whole run; ``checks``: how they check
-themselves; ``unread``: settings that the chosen method does not read.
+``evaluation``: how the result is evaluated; ``people``: likewise, by held-out real people; ``run``:
+a whole run; ``checks``: how they check themselves; ``unread``: settings that the chosen method does
+not read.
 """
 
 from popl_rl.config.checks import Checker, parse_epsilon

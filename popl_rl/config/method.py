@@ -76,6 +76,7 @@ class RefinementSettings:
     steps: int = 1500  # CPL steps; 0 for none (policies, gradient variation, rater ids)
     folds: int = 4  # folds of the cross-fitting
     most: int = 8  # members to begin with, at most
+    rewards: bool = False  # refine reward functions too
 
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""

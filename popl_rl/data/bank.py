@@ -57,8 +57,8 @@ class SegmentBank:
     def to(self, device: torch.device | str) -> "SegmentBank":
         """The same segments on another device."""
         mask = None if self.mask is None else self.mask.to(device)
-        moved = (each.to(device) for each in (self.observation, self.row, self.action))
-        return SegmentBank(*moved, self.is_shared, mask)
+        observation, row = self.observation.to(device), self.row.to(device)
+        return SegmentBank(observation, row, self.action.to(device), self.is_shared, mask)
 
     def weights(self, segment: Tensor | slice, *, discount: float = 1.0) -> Tensor:
         """What each step counts for in a segment's score: its discount, 0 where there is none.

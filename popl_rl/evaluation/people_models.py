@@ -1,4 +1,4 @@
-"""Predictors that have a hypothesis of its own for each person: fine-tuned, or told by an encoder."""
+"""Predictors with a hypothesis of its own for each person: fine-tuned, or told by an encoder."""
 
 from collections.abc import Iterator
 
@@ -125,7 +125,7 @@ class EncodedPredictor(_OwnHypothesis):
     @torch.no_grad()
     def _population(self, questions: Questions, trials: slice, answers: int) -> Population:
         told = questions.told[trials].clamp(max=answers)
-        z = torch.zeros(len(told), self.method.encoder.belief[-1].out_features // 2)
+        z = torch.zeros(len(told), self.method.latent)
         for count in told.unique().tolist():
             if not count:
                 continue  # the prior's mean

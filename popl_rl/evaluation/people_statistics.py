@@ -49,9 +49,8 @@ def paired_bootstrap(
     means = np.empty(samples)
     for start in range(0, samples, 200):  # a matrix of all would not fit with many people
         size = (min(200, samples - start), len(difference))
-        means[start : start + 200] = difference[
-            generator.integers(len(difference), size=size)
-        ].mean(1)
+        drawn = generator.integers(len(difference), size=size)
+        means[start : start + 200] = difference[drawn].mean(1)
     low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
     return mean, float(low), float(high)
 

@@ -33,7 +33,7 @@ def _points(results: pd.DataFrame) -> list[int]:
 
 
 def _rows(results: pd.DataFrame, group: str) -> list[list[str]]:
-    """Cells of each method: accuracy after K answers, the last gain over pooled CPL and its cost."""
+    """Cells of each method: accuracies after K answers, and the last gain over pooled CPL."""
     rows = results[results["group"] == group]
     points = _points(rows)
     lines = []

@@ -1,4 +1,4 @@
-"""The steps of a run that learns from real people, as ``popl-train`` and ``popl-people`` take them."""
+"""Steps of a run that learns from real people, as ``popl-train`` and ``popl-people`` take them."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path

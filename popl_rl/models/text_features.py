@@ -1,6 +1,6 @@
 """Features of texts: words and length by scikit-learn, or a language model from a local folder.
 
-Nothing is downloaded: a model is a folder that is there, in the layout of Hugging Face transformers.
+Nothing is downloaded: a model is a folder that is there, as Hugging Face transformers writes it.
 """
 
 import hashlib
@@ -94,7 +94,7 @@ def language_model_features(
         ``[N, F]``.
 
     Raises:
-        ValueError: If transformers is missing, ``folder`` holds no model, or ``pooling`` is unknown.
+        ValueError: If transformers is missing, ``folder`` holds no model, or ``pooling`` is off.
     """
     _need("transformers", "transformers")
     if pooling not in ("mean", "last"):

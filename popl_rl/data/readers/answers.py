@@ -40,7 +40,11 @@ def read_answers(
     text = column.astype("string").str.strip().str.lower()
     by_word = text.map(_WORDS)
     number = pd.to_numeric(text.where(by_word.isna()), errors="coerce")
-    value = by_word.astype("Float64").fillna(number.astype("Float64")).to_numpy(float, np.nan)
+    value = (
+        by_word.astype("Float64")
+        .fillna(number.astype("Float64"))
+        .to_numpy("float64", na_value=np.nan)
+    )
     problems.add(text.isna(), f"the answer is missing; {_EXPECTED}")
     shown = text.fillna("")
     unknown = np.isnan(value) & text.notna().to_numpy()
@@ -56,7 +60,7 @@ def read_answers(
     value = np.where(np.isfinite(value), value, 0.0)
     if not is_soft:
         return np.clip(value, 0, max(Answer)).astype(np.int64), None
-    words = by_word.astype("Float64").to_numpy(float, np.nan)
+    words = by_word.astype("Float64").to_numpy("float64", na_value=np.nan)
     chance = np.where(words == Answer.TIE, 0.5, value)
     answer = np.where(chance == 0.5, Answer.TIE, (chance > 0.5).astype(np.int64))
     answer = np.where(words == Answer.SKIP, Answer.SKIP, answer)

@@ -82,7 +82,7 @@ def read_chosen(
                 f"{path}, got {len(values)}"
             )
     said = pd.concat(kept, ignore_index=True)
-    columns = [said[name] if name in said else None for name in (rater, condition)]
+    columns = [said.get(name) for name in (rater, condition)]
     preferences, raters, conditions = preferences_of(pair, answer, None, *columns)
     names = Names([], raters, conditions, [str(text) for text in texts])
     return Imported(features_as_segments(values), preferences, names)

@@ -33,8 +33,8 @@ def read_npz(path: Path, *, score: str | None = None, one_sided: bool = False) -
     ``answer`` ``[M]``. (2) ``obs``, ``action`` and a number for each segment, as CPL (arXiv
     2310.13639) publishes: segments 2i and 2i + 1 are compared, the larger number is preferred, and
     equal ones are ties. (3) CPL's older ``obs_1 obs_2 action_1 action_2`` with ``label``, 1 (or
-    near it) where the second is preferred. ``rater``, ``condition``, ``chance`` (soft labels beside codes) ``[M]`` and
-    ``mask`` ``[N, T]`` may be there.
+    near it) where the second is preferred. ``rater``, ``condition``, ``chance`` ``[M]``
+    (soft labels beside codes) and ``mask`` ``[N, T]`` may be there.
 
     Args:
         path: The file.

@@ -81,8 +81,8 @@ def read_table(
     problems.check()
     if not one_sided:
         check_sides(code, path)
-    who = said["rater"] if "rater" in said else None
-    what = said["condition"] if "condition" in said else None
+    who = said.get("rater")
+    what = said.get("condition")
     preferences, raters, conditions = preferences_of(pair, code, chance, who, what)
     names = Names(things.ids, raters, conditions, things.texts)
     return Imported(things.segments, preferences, names)

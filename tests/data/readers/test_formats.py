@@ -1,4 +1,4 @@
-"""npz as CPL publishes it, chosen and rejected texts, Minari, and our own formats there and back."""
+"""npz as CPL publishes it, chosen and rejected texts, Minari, and ours there and back."""
 
 import json
 
@@ -179,6 +179,7 @@ def test_contradictions_are_counted(tmp_path):
     assert found.agreement == pytest.approx(1 / 3)
 
 
+@pytest.mark.filterwarnings("ignore:env_spec is None")
 def test_segments_of_a_minari_data_set(tmp_path, monkeypatch):
     minari = pytest.importorskip("minari")
     pytest.importorskip("h5py")

@@ -116,7 +116,7 @@ def test_what_makes_no_sense_is_refused_with_its_row(folder, text, message):
 
 
 def test_all_that_is_wrong_is_told_at_once(folder):
-    with pytest.raises(ValueError, match="said.csv cannot be used") as caught:
+    with pytest.raises(ValueError, match=r"said\.csv cannot be used") as caught:
         read(folder, HEAD + "x,a,a,0\nx,a,zz,1\n" + "x,b,zz,1\n" * 7)
     assert "rows 3, 4, 5, 6, 7 and 3 more" in str(caught.value)
     assert "row 2: an item is compared with itself" in str(caught.value)
@@ -186,7 +186,7 @@ def test_actions_may_be_vectors(folder):
 
 
 def test_what_is_compared_must_be_said_once(folder):
-    with pytest.raises(ValueError, match="either items=<table or .npy> or segments="):
+    with pytest.raises(ValueError, match=r"either items=<table or \.npy> or segments="):
         read_table(folder / "said.csv")
 
 
@@ -195,7 +195,7 @@ def test_the_reader_is_found_by_the_file(folder):
     assert guess_reader(folder / "said.csv") == "table"
     assert guess_reader(folder / "pairs.jsonl") == "chosen"
     (folder / "what.xyz").write_text("")
-    with pytest.raises(ValueError, match="no reader is known for what.xyz; name one of"):
+    with pytest.raises(ValueError, match=r"no reader is known for what\.xyz; name one of"):
         guess_reader(folder / "what.xyz")
     with pytest.raises(FileNotFoundError, match="there is no file or folder"):
         guess_reader(folder / "nothing.csv")
