@@ -142,7 +142,7 @@ def _alone(table: pd.DataFrame, seed: int) -> dict[str, float]:
 
 
 def _beside(table: pd.DataFrame, other: pd.DataFrame, name: str, seed: int) -> Mapping[str, float]:
-    both = table.join(other, how="inner", rsuffix="_other")
+    both = table.join(other.add_suffix("_other"), how="inner")
     ours, theirs = both["accuracy"].to_numpy(float), both["accuracy_other"].to_numpy(float)
     found = {}
     for measure, value in compare(ours, theirs, seed=seed).items():

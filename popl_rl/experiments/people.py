@@ -42,6 +42,7 @@ __all__ = [
     "train_on",
 ]
 
+_VPL_HIDDEN = (32,)  # where all other hypotheses are linear
 _E_STEPS = 30  # of the shares of a finished set's members
 
 
@@ -271,7 +272,10 @@ def train_on(
         run: Runs a method to its end.
     """
     settings = method_config(config.method, config.method.name if name in _SINGLE else name)
-    problem = build_problem(settings, people.spec, people.bank, fold.training)
+    spec = people.spec
+    if "vpl" in settings.reads and not spec.hidden and not spec.output_bias:
+        spec = replace(spec, hidden=_VPL_HIDDEN)  # z is added to the inputs of a hidden layer
+    problem = build_problem(settings, spec, people.bank, fold.training)
     generator = stream(config.seed, f"people/{fold.number}/{name}")
     if name in _SINGLE:
         weight = torch.ones(1, len(fold.training))

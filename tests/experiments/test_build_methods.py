@@ -158,5 +158,5 @@ def test_vpl_needs_ids_policies_and_whole_networks(learner, learning):
         built(learner, (spec, bank, alone), **vpl)
     with pytest.raises(ValueError, match=r"method\.evolve must be all for method vpl"):
         built(learner, learning, evolve="head", **vpl)
-    with pytest.raises(ValueError, match="method vpl learns policies, not reward functions"):
-        built(learner, (RewardSpec(5, 2, (6,)), bank, comparisons), **vpl)
+    with pytest.raises(ValueError, match="method vpl needs a hidden layer"):
+        built(learner, (RewardSpec(5, 2, ()), bank, comparisons), **vpl)
