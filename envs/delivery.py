@@ -32,7 +32,8 @@ class DeliveryGrid(gymnasium.Env[Any, Any]):
     """Drive up, down, left or right; goal and sheep end the episode, houses block the way.
 
     The observation says in which cell one is, float32 ``[cells]`` with a single 1. The ``info``
-    holds ``state``, the number of the cell, and ``goal``, 1 when it has been reached.
+    holds ``state`` and ``next_state``, the numbers of the cells before and after the step, and
+    ``goal``, 1 when it has been reached.
 
     Args:
         board: An ``npz`` file with ``board`` ``[rows, columns]`` (0 road, 1 goal, 2 house, 3 sheep,
@@ -137,15 +138,16 @@ class DeliveryGrid(gymnasium.Env[Any, Any]):
         """Start an episode."""
         super().reset(seed=seed, options=options)
         self.cell, self.steps = int(self.np_random.choice(self.starts)), 0
-        return self.observe(self.cell), {"state": self.cell, "goal": 0}
+        return self.observe(self.cell), {"state": self.cell, "next_state": self.cell, "goal": 0}
 
     def step(self, action: int) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Drive one cell."""
-        reward = float(self.step_reward.reshape(self.cells, -1)[self.cell, action])
-        self.cell = self._after(self.cell, int(action))
+        before = self.cell
+        reward = float(self.step_reward.reshape(self.cells, -1)[before, action])
+        self.cell = self._after(before, int(action))
         self.steps += 1
         kind = self.kind.flat[self.cell]
-        info = {"state": self.cell, "goal": int(kind == _GOAL)}
+        info = {"state": before, "next_state": self.cell, "goal": int(kind == _GOAL)}
         ended = bool(kind in (_GOAL, _SHEEP))
         return self.observe(self.cell), reward, ended, self.steps >= self.max_steps, info
 
@@ -169,7 +171,11 @@ class DeliveryGrid(gymnasium.Env[Any, Any]):
                 OBSERVATION: observation.unsqueeze(1).expand(*shape, -1).contiguous(),
                 ACTION: torch.arange(self.actions).expand(shape).contiguous(),
                 REWARD: reward.masked_fill(closed, 0.0),
-                INFO: {"state": state, "goal": goal.long().masked_fill(closed, 0)},
+                INFO: {
+                    "state": state,
+                    "next_state": next_state,
+                    "goal": goal.long().masked_fill(closed, 0),
+                },
             },
             shape,
         )

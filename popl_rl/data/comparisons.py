@@ -27,6 +27,8 @@ class Comparisons:
         num_cases: Number of cases C.
         num_dropped: Ties and skips that were left out.
         weight: How much each comparison counts, ``[M]`` in (0, 1]; None if all count 1.
+        answer: Number of the answer that each comparison is of, ``[M]``, the same for the two
+            comparisons of one answer; None if every comparison is an answer.
     """
 
     preferred: Tensor
@@ -35,6 +37,7 @@ class Comparisons:
     num_cases: int
     num_dropped: int = 0
     weight: Tensor | None = None
+    answer: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.preferred)
@@ -118,6 +121,7 @@ class Comparisons:
             count,
             dropped,
             torch.cat([1 - doubt, doubt[unsure]]),
+            torch.cat([torch.arange(len(preferred), device=pair.device), unsure]),
         )
 
     def to(self, device: torch.device | str) -> "Comparisons":
@@ -129,14 +133,28 @@ class Comparisons:
             self.num_cases,
             self.num_dropped,
             None if self.weight is None else self.weight.to(device),
+            None if self.answer is None else self.answer.to(device),
         )
 
     def rows(self, index: Tensor) -> "Comparisons":
         """Some of the comparisons; cases keep their numbers, and nothing counts as dropped."""
-        weight = None if self.weight is None else self.weight[index]
         return Comparisons(
-            self.preferred[index], self.other[index], self.case[index], self.num_cases, 0, weight
+            self.preferred[index],
+            self.other[index],
+            self.case[index],
+            self.num_cases,
+            0,
+            None if self.weight is None else self.weight[index],
+            None if self.answer is None else self.answer[index].unique(return_inverse=True)[1],
         )
+
+    def per_answer(self, value: Tensor) -> Tensor:
+        """Weighted sums over the comparisons of the same answer, at each of them, ``[..., M]``."""
+        value = self.weighted(value)
+        if self.answer is None:
+            return value
+        total = value.new_zeros(*value.shape[:-1], int(self.answer.max()) + 1)
+        return total.index_add_(-1, self.answer, value)[..., self.answer]
 
 
 def _named(rater: Tensor) -> Tensor:

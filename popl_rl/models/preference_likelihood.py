@@ -52,6 +52,6 @@ def leave_one_out(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
     Returns:
         Log-likelihood of each comparison under that member, ``[M]``.
     """
-    own = comparisons.weighted(likelihood)
+    own = comparisons.per_answer(likelihood)
     others = per_case(likelihood, comparisons)[:, comparisons.case] - own
     return likelihood.gather(0, others.argmax(0, keepdim=True))[0]

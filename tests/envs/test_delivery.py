@@ -33,10 +33,12 @@ def test_the_table_is_what_steps_do():
             grid.reset(seed=0)
             grid.cell = int(cell)
             observation, reward, ended, _, info = grid.step(action)
-            assert table.next_state[cell, action] == info["state"]
+            assert table.next_state[cell, action] == info["next_state"]
             assert table.terminal[cell, action] == ended
             assert table.steps["reward"][cell, action] == reward
-            assert table.steps["observation"][info["state"], 0].tolist() == observation.tolist()
+            assert (
+                table.steps["observation"][info["next_state"], 0].tolist() == observation.tolist()
+            )
     assert table.start.sum() == pytest.approx(1)
     advantage, value = solve(table, table.steps["reward"], discount=0.99)
     assert value[2] == 50
