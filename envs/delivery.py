@@ -9,16 +9,19 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import pandas as pd
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
+from popl_rl.data.readers.imported import Imported, Names
+from popl_rl.data.readers.table import preferences_of
 from popl_rl.data.tables import Table
-from popl_rl.keys import ACTION, INFO, OBSERVATION, REWARD
-from popl_rl.registry import env
+from popl_rl.keys import ACTION, INFO, MASK, OBSERVATION, REWARD
+from popl_rl.registry import env, reader
 
-__all__ = ["DeliveryGrid", "delivery"]
+__all__ = ["DeliveryGrid", "delivery", "read_delivery"]
 
 _GOAL, _HOUSE, _SHEEP = 1, 2, 3
 _KINDS = 6  # road, goal, house, sheep, coin, roadblock; the same + 6 on mud
@@ -132,6 +135,36 @@ class DeliveryGrid(gymnasium.Env[Any, Any]):
             cell = np.where(step >= 0, after[cell, np.maximum(step, 0)], cell)
         return np.stack(cells, 1).astype(np.int64), action >= 0
 
+    def step_features(self) -> NDArray[np.float32]:
+        """What a step does, in numbers that any board has, ``[cells, actions, 10]``.
+
+        Whether it enters a road, goal, sheep, coin or roadblock, or is blocked; whether it leaves
+        mud and enters mud; cells by which it nears the goal; and the distance from it, in fives.
+        """
+        columns = self.board.shape[1]
+        goal = np.argwhere(self.kind == _GOAL)[0]
+        place = np.stack(np.divmod(np.arange(self.cells), columns), 1)
+        away = np.abs(place - goal).sum(1)
+        mud = (self.board >= _KINDS).ravel()
+        features = np.zeros((self.cells, self.actions, 10), np.float32)
+        for cell in range(self.cells):
+            for action in range(self.actions):
+                after = self._after(cell, action)
+                kind = self.kind.flat[after] if after != cell else _HOUSE
+                own = features[cell, action]
+                own[kind] = 1
+                own[6:] = mud[cell], mud[after], away[cell] - away[after], away[cell] / 5
+        return features
+
+    def cell_features(self) -> NDArray[np.float32]:
+        """What is in a cell, beside it in each direction, and where the goal is, ``[cells, F]``."""
+        columns = self.board.shape[1]
+        place = np.stack(np.divmod(np.arange(self.cells), columns), 1)
+        goal = np.argwhere(self.kind == _GOAL)[0]
+        step = self.step_features()[..., :8].reshape(self.cells, -1)
+        found: NDArray[np.float32] = np.concatenate([step, (goal - place) / 5], 1, dtype=np.float32)
+        return found
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
@@ -201,3 +234,53 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
 def delivery(**options: Any) -> DeliveryGrid:
     """Build a :class:`DeliveryGrid`; arguments are its own."""
     return DeliveryGrid(**options)
+
+
+@reader("delivery")
+def read_delivery(path: Path, *, features: str = "step") -> Imported:
+    """Read what people said about pairs of segments on a board, beside the board itself.
+
+    Args:
+        path: An ``npz`` file with the board and, of M comparisons, ``start`` ``[M, 2, 2]``,
+            ``action`` ``[M, 2, T]`` (-1 where the episode has ended), ``answer`` ``[M]``, and
+            perhaps ``rater`` (-1 where unknown) and ``condition`` ``[M]`` with their names
+            ``conditions``.
+        features: ``"step"``: observations say what the step does (see
+            :meth:`DeliveryGrid.step_features`), for reward functions of a step; ``"cell"``: they
+            say what is around the cell, and actions are kept, for policies. The ``info`` holds the
+            cell (``state``) and the action (``taken``) of each step either way.
+
+    Raises:
+        ValueError: If an array is missing, or ``features`` is neither.
+    """
+    if features not in ("step", "cell"):
+        raise ValueError(f"features must be 'step' or 'cell', got {features!r}")
+    grid = DeliveryGrid(board=str(path))
+    with np.load(path, allow_pickle=False) as file:
+        missing = [name for name in ("start", "action", "answer") if name not in file]
+        if missing:
+            raise ValueError(f"{path} must hold {', '.join(missing)} of the comparisons")
+        held = {name: file[name] for name in file.files}
+    walks = np.concatenate([held["start"], held["action"]], -1)
+    different, row = np.unique(walks.reshape(-1, walks.shape[-1]), axis=0, return_inverse=True)
+    cell, there = grid.walk(different[:, :2], different[:, 2:])
+    action = np.maximum(different[:, 2:], 0).astype(np.int64)
+    seen = grid.step_features()[cell, action] if features == "step" else grid.cell_features()[cell]
+    steps = {
+        OBSERVATION: torch.from_numpy(seen),
+        ACTION: torch.from_numpy(np.zeros_like(action) if features == "step" else action),
+        MASK: torch.from_numpy(there),
+        INFO: {"state": torch.from_numpy(cell), "taken": torch.from_numpy(action)},
+    }
+    pair = row.reshape(-1, 2)
+    kept = pair[:, 0] != pair[:, 1]  # a segment shown beside itself says nothing
+    columns = []
+    for name in ("rater", "condition"):
+        values = pd.Series(held[name][kept]) if name in held else None
+        columns.append(None if values is None else values.where(values >= 0).astype("Int64"))
+    answer = held["answer"][kept].astype(np.int64)
+    preferences, raters, conditions = preferences_of(pair[kept], answer, None, *columns)
+    if "conditions" in held:
+        conditions = [str(held["conditions"][int(number)]) for number in conditions]
+    segments = TensorDict(steps, list(there.shape))
+    return Imported(segments, preferences, Names([], raters, conditions))

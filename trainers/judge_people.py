@@ -46,7 +46,8 @@ def run(config: Config) -> Result:
 
     config, run_dir = steps.open_run(config, command=sys.argv)
     people = people_steps.read_people(config, run_dir)
-    methods = [*people_steps.REFERENCES, *config.people.methods]
+    told = ["oracle"] if any(people.groups) and config.method.ties == "drop" else []
+    methods = [*people_steps.REFERENCES, *told, *config.people.methods]
     table = people_steps.compare_methods(
         config,
         people,

@@ -15,7 +15,7 @@ from torch import Tensor
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.preference_likelihood import MISTAKE, log_likelihood
 
-__all__ = ["Predictor", "Questions", "SetPredictor", "draw_questions", "judge"]
+__all__ = ["Predictor", "Questions", "SetPredictor", "ToldPredictor", "draw_questions", "judge"]
 
 _LOG_HALF = -0.6931471805599453
 
@@ -158,6 +158,23 @@ class SetPredictor:
         chosen = belief.argmax(-1, keepdim=True)
         chance = self.likelihood[chosen, questions.judged]
         return chance, _right(self.margin[chosen, questions.judged])
+
+
+class ToldPredictor:
+    """Predicts by the hypothesis of the condition that a person is of: it is told which.
+
+    Args:
+        margin: Margins of the G conditions' hypotheses on M comparisons, ``[G, M]``.
+        hypothesis: Which is each person's, by case, ``[C]``.
+    """
+
+    def __init__(self, margin: Tensor, hypothesis: Tensor) -> None:
+        self.margin, self.hypothesis = margin, hypothesis
+
+    def __call__(self, questions: Questions, answers: int, /) -> tuple[Tensor, Tensor]:  # noqa: ARG002
+        """See :class:`Predictor`; the answers told are not needed."""
+        own = self.margin[self.hypothesis[questions.person].unsqueeze(1), questions.judged]
+        return log_likelihood(own, MISTAKE), _right(own)
 
 
 def _right(margin: Tensor) -> Tensor:

@@ -18,7 +18,14 @@ from popl_rl.config import Config, MethodConfig, PeopleConfig
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.data.readers.imported import Imported
-from popl_rl.evaluation.people import Predictor, Questions, SetPredictor, draw_questions, judge
+from popl_rl.evaluation.people import (
+    Predictor,
+    Questions,
+    SetPredictor,
+    ToldPredictor,
+    draw_questions,
+    judge,
+)
 from popl_rl.evaluation.people_models import EncodedPredictor, IndividualPredictor
 from popl_rl.evaluation.people_statistics import PERSON_COLUMNS
 from popl_rl.experiments.builders import build_method, build_problem
@@ -35,6 +42,8 @@ __all__ = [
     "Fold",
     "People",
     "Trained",
+    "as_trained",
+    "catered_members",
     "judge_fold",
     "method_config",
     "people_of",
@@ -81,12 +90,15 @@ class Fold:
         held_out: Persons who judge.
         training: Answers to learn from, with soft labels and ties if these count.
         validation: Answers by which scales and numbers are chosen; their people are in neither.
+        groups: Condition of each case to learn from, which the oracle alone is told; empty if
+            nobody knows.
     """
 
     number: int
     held_out: list[int]
     training: Comparisons
     validation: Comparisons
+    groups: list[str]
 
 
 @dataclass(frozen=True)
@@ -184,7 +196,10 @@ def split(people: People, config: PeopleConfig, number: int, *, ties: str, seed:
     # Cases of people with ties alone have no number among the strict answers.
     learnt = _of_people(everything, people, others & ~chosen) if ties == "count" else None
     training = learnt or _some(people.answers, others & ~chosen)
-    return Fold(number, held_out.tolist(), training, _some(people.answers, chosen))
+    groups = []
+    if learnt is None and any(people.groups):
+        groups = [people.groups[case] for case in (others & ~chosen).nonzero()[:, 0].tolist()]
+    return Fold(number, held_out.tolist(), training, _some(people.answers, chosen), groups)
 
 
 def _some(answers: Comparisons, chosen: Tensor) -> Comparisons:
@@ -268,7 +283,8 @@ def train_on(
         people: Everybody.
         fold: Whom to learn from.
         config: Settings of the run.
-        name: ``pooled_cpl``, ``individual``, or a method of ``configs/method``.
+        name: ``pooled_cpl``, ``individual``, ``oracle`` (told the conditions), or a method of
+            ``configs/method``.
         run: Runs a method to its end.
     """
     settings = method_config(config.method, config.method.name if name in _SINGLE else name)
@@ -277,6 +293,8 @@ def train_on(
         spec = replace(spec, hidden=_VPL_HIDDEN)  # z is added to the inputs of a hidden layer
     problem = build_problem(settings, spec, people.bank, fold.training)
     generator = stream(config.seed, f"people/{fold.number}/{name}")
+    if name == "oracle":
+        return _oracle(people, fold, problem, generator)
     if name in _SINGLE:
         weight = torch.ones(1, len(fold.training))
         pooled = run(GroupCPL(problem, weight=weight, generator=generator))
@@ -307,10 +325,29 @@ def train_on(
         return Trained(
             name, {"encoder": EncodedPredictor(method, people.answers, scale=scale)}, found
         )
-    return _as_trained(name, found, people, fold)
+    return as_trained(name, found, people, fold)
 
 
-_SINGLE = ("pooled_cpl", "individual")
+_SINGLE = ("pooled_cpl", "individual", "oracle")
+
+
+def _oracle(people: People, fold: Fold, problem: Problem, generator: torch.Generator) -> Trained:
+    """One hypothesis for each condition, trained on the answers of people of that condition."""
+    names = sorted({*fold.groups} - {""})
+    if not names:
+        raise ValueError(
+            "the oracle is told the conditions that people are of, and none are known; add a "
+            "column 'condition', or leave 'oracle' out of people.methods (it needs ties=drop)"
+        )
+    code = {name: place for place, name in enumerate(names)}
+    group = torch.tensor([code.get(name, -1) for name in fold.groups])[fold.training.case]
+    weight = torch.stack([(group == place).float() for place in range(len(names))])
+    found = train(GroupCPL(problem, weight=weight, generator=generator))
+    own = _margins(found, people, fold.training)[group.clamp(min=0), torch.arange(len(group))]
+    found.alpha *= _scale_of_margins(own[group >= 0])
+    told = torch.tensor([code.get(name, 0) for name in people.groups])
+    predictor = ToldPredictor(_margins(found, people, people.answers), told)
+    return Trained("oracle", {"": predictor}, found)
 
 
 def _margins(found: HypothesisSet, people: People, comparisons: Comparisons) -> Tensor:
@@ -343,7 +380,7 @@ def _scale(margin: Tensor, comparisons: Comparisons) -> float:
     return SCALES[int(torch.stack(each).argmax())]
 
 
-def _as_trained(name: str, found: HypothesisSet, people: People, fold: Fold) -> Trained:
+def as_trained(name: str, found: HypothesisSet, people: People, fold: Fold) -> Trained:
     """A set that is catered, that mixes, and of which one serves all."""
     found.alpha *= _scale(_margins(found, people, fold.validation), fold.validation)
     learnt = _margins(found, people, fold.training)
@@ -381,13 +418,36 @@ def _best_em(
         if value > most:
             best, most = found, value
     assert best is not None
-    return _as_trained("em", best, people, fold)
+    return as_trained("em", best, people, fold)
 
 
 def _all_questions(answers: Comparisons) -> Questions:
     """Questions of everybody with two answers or more, for scales."""
     able = (answers.sizes() >= 2).nonzero()[:, 0].tolist()
     return draw_questions(answers, able, generator=torch.Generator().manual_seed(0))
+
+
+def catered_members(
+    people: People, fold: Fold, found: HypothesisSet, *, answers: int, seed: int
+) -> dict[int, int]:
+    """The member that each held-out person is given after some answers.
+
+    Args:
+        people: Everybody.
+        fold: Who is held out.
+        found: A set that was trained on the others, as :func:`as_trained` has scaled it.
+        answers: Answers that are told.
+        seed: Seed of which they are.
+
+    Returns:
+        Member by case of the person.
+    """
+    posterior = as_trained("", found, people, fold).predictors["posterior"]
+    assert isinstance(posterior, SetPredictor)
+    generator = stream(seed, f"held-out people/{fold.number}")
+    questions = draw_questions(people.answers, fold.held_out, most=answers, generator=generator)
+    chosen = posterior.belief(questions, answers).argmax(1)
+    return dict(zip(questions.person.tolist(), chosen.tolist(), strict=True))
 
 
 def judge_fold(

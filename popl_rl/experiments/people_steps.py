@@ -1,5 +1,6 @@
 """Steps of a run that learns from real people, as ``popl-train`` and ``popl-people`` take them."""
 
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -93,7 +94,8 @@ def compare_methods(
 ) -> pd.DataFrame:
     """Train methods on folds and judge them by the people who are held out of each.
 
-    What has been done is read from ``cells``, so that a killed comparison goes on.
+    What has been done is read from ``cells``, so that a killed comparison goes on; the sets are
+    there too.
 
     Args:
         config: Settings of the run.
@@ -116,6 +118,9 @@ def compare_methods(
                 path = cells / f"{name}-{number}.csv"
                 if not path.is_file():
                     trained = known(name, number) or train_on(people, fold, config, name, run=train)
+                    if trained.found is not None:
+                        shutil.rmtree(cells / f"{name}-{number}", ignore_errors=True)
+                        trained.found.save(cells / f"{name}-{number}")
                     table = judge_fold(people, fold, trained, config.people, seed=config.seed)
                     write_atomic(path, table.to_csv(index=False))
                 text = {"choice": "str", "person": "str", "group": "str"}
