@@ -45,11 +45,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             data = given.folder / "delivery.npz"
         config = _config(given.study, data, out, given.setting)
         result = judge_people.run(config)
+        rows = result.results
         if given.study == "arguments":
             _tell_arguments(out)
         else:
             _tell_delivery(data, out)
-        _write_rows(given.study, result.results, out)
+            rows = _with_kinds(rows, out / "comparison")
+        _write_rows(given.study, rows, out)
         judge_people.show(result)
     except USER_ERRORS as error:
         sys.stderr.write(f"error: {error}\n")
@@ -110,6 +112,19 @@ def _tell_delivery(data: Path, out: Path) -> None:
     print(fits.round(3).to_string(index=False))
 
 
+def _with_kinds(rows: "pd.DataFrame", run_dir: Path) -> "pd.DataFrame":
+    """Rows of all people who were led to look at the same, besides those of their conditions."""
+    import pandas as pd
+
+    from popl_rl.evaluation.people_statistics import summarise_people
+    from popl_rl.experiments.delivery_study import led_to
+
+    people = pd.read_csv(run_dir / "people.csv", keep_default_na=False, dtype={"person": "str"})
+    people["group"] = people["group"].map(led_to)
+    kinds = summarise_people(people, references=[("pooled_cpl", ""), ("individual", "")])
+    return pd.concat([rows, kinds[kinds["group"] != "all"]], ignore_index=True)
+
+
 def _tell_arguments(out: Path) -> None:
     """What the members of the first fold's set want, and the pairs that tell them apart."""
     from popl_rl.config import MethodConfig
@@ -131,7 +146,8 @@ def _tell_arguments(out: Path) -> None:
     low, high = int(wants["length"].argmin()), int(wants["length"].argmax())
     pairs = argument_study.telling_pairs(scores, people, one=low, other=high)
     text = "\n\n".join(
-        f"## Pair {place}\n\nMember {low} prefers:\n\n> {left}\n\nMember {high} prefers:\n\n> {right}"
+        f"## Pair {place}\n\nMember {low} prefers:\n\n> {left}\n\n"
+        f"Member {high} prefers:\n\n> {right}"
         for place, (left, right) in enumerate(pairs, 1)
     )
     write_atomic(out / "pairs.md", f"# The most telling pairs\n\n{text}\n")
@@ -141,10 +157,9 @@ def _write_rows(study: str, results: "pd.DataFrame", out: Path) -> None:
     """Rows as of a benchmark, for ``python -m popl_rl.trainers.make_tables``."""
     from popl_rl.storage import write_atomic
 
-    rows = results.copy()
-    for place, (name, value) in enumerate([("suite", study), ("scenario", study), ("seed", 0)]):
-        rows.insert(place, name, value)
-    write_atomic(out / "results.csv", rows.to_csv(index=False))
+    rows = results.assign(suite=study, scenario=study, seed=0)
+    columns = ["suite", "scenario", "seed", *results.columns]
+    write_atomic(out / "results.csv", rows[columns].to_csv(index=False))
 
 
 def cli() -> None:

@@ -17,7 +17,14 @@ from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.sets import load_set
 
-__all__ = ["Acting", "act_for_people", "exact_returns", "response_fits", "step_scores"]
+__all__ = [
+    "Acting",
+    "act_for_people",
+    "exact_returns",
+    "led_to",
+    "response_fits",
+    "step_scores",
+]
 
 _DISCOUNT = 0.99
 _HORIZON = 60
@@ -28,10 +35,10 @@ class Acting:
     """What members do on the grid.
 
     Attributes:
-        returns: Rows ``method, person, group, member, fold, greedy, planned``: shares of the optimum by
-            the grid's own reward (0: random steps), of acting greedily by the member's scores and
-            of planning for them as rewards.
-        policies: Greedy action in each cell of the member that most people of a group are given in
+        returns: Rows ``method, person, group, member, fold, greedy, planned``: shares of the
+            optimum by the grid's own reward (0: random steps), of acting greedily by the member's
+            scores and of planning for them as rewards.
+        policies: Planned action in each cell of the member that most people of a group are given in
             the first fold, ``[S]``, by group; of the hypothesis for all under ``pooled CPL``.
     """
 
@@ -72,10 +79,12 @@ def step_scores(found: HypothesisSet, grid: Any) -> Tensor:
     if isinstance(spec, PolicySpec):
         seen = torch.from_numpy(grid.cell_features())
         output: Tensor = found.population(seen)
-        return spec.table(output) * found.alpha
+        table: Tensor = spec.table(output) * found.alpha
+        return table
     features = torch.from_numpy(grid.step_features())
     flat: Tensor = found.population(features.flatten(0, 1))
-    return flat[..., 0].unflatten(1, features.shape[:2]) * found.alpha
+    scores: Tensor = flat[..., 0].unflatten(1, features.shape[:2]) * found.alpha
+    return scores
 
 
 def act_for_people(
@@ -91,7 +100,8 @@ def act_for_people(
         answers: Answers that are told.
     """
     table = grid.transition_table()
-    rows, policies = [], {}
+    rows: list[tuple[Any, ...]] = []
+    policies: dict[str, Tensor] = {}
     for number in range(config.people.folds):
         fold = split(people, config.people, number, ties=config.method.ties, seed=config.seed)
         for method in ("popl", "pooled_cpl"):
@@ -118,21 +128,31 @@ def _typical(
     if method != "popl":
         return {"pooled CPL": solve(table, score[0], discount=_DISCOUNT)[0].argmax(1)}
     found = {}
-    for kind in ("pr-", "regret-"):
-        members = [m for case, m in given.items() if people.groups[case].startswith(kind)]
+    for kind in ("pr", "regret"):
+        members = [m for case, m in given.items() if led_to(people.groups[case]) == kind]
         if members:
             most = int(np.bincount(members).argmax())
             plan = solve(table, score[most], discount=_DISCOUNT)[0]
-            found[f"given to {kind.rstrip('-')} people"] = plan.argmax(1)
+            found[f"given to {kind} people"] = plan.argmax(1)
     return found
+
+
+def led_to(group: str) -> str:
+    """What a condition has led people to look at: ``pr`` (partial return), ``regret``, or nothing.
+
+    Args:
+        group: Name of the condition, such as ``pr-trained`` or ``trained-control``.
+    """
+    kind = group.partition("-")[0]
+    return kind if kind in ("pr", "regret") else ""
 
 
 def response_fits(people: People, grid: Any, walks: Tensor) -> pd.DataFrame:
     """How people answer, as the response model of simulated raters has it.
 
     For each condition the partial return and the regret of the two segments are known exactly. The
-    likelihood of the strict answers under ``(1 - slip) sigmoid(beta difference) + slip sigmoid(-beta
-    difference)`` is maximised for both, on a grid of rationalities beta and slips.
+    likelihood of the strict answers, ``(1 - slip) sigmoid(beta d) + slip sigmoid(-beta d)`` for a
+    difference d, is maximised for both, on a grid of rationalities beta and slips.
 
     Args:
         people: Everybody; with conditions.

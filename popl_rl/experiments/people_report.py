@@ -76,11 +76,16 @@ def people_table(results: pd.DataFrame, *, group: str = "all") -> Table:
         results: Rows as of :func:`~popl_rl.evaluation.people_statistics.summarise_people`.
         group: Which people.
     """
+    points = _points(results)
+    # As many columns as a terminal of 80 has room for: first, middle and last, and the gain.
+    shown = sorted({points[0], points[len(points) // 2], points[-1]})
     table = Table(title="How many further answers of new people are predicted?")
-    for place, name in enumerate(_head(results)):
-        table.add_column(name, justify="right" if place else "left")
+    table.add_column("method")
+    for answers in shown:
+        table.add_column(f"after {answers}", justify="right", no_wrap=True)
+    table.add_column("gain over pooled", justify="right", no_wrap=True)
     for cells in _rows(results, group):
-        table.add_row(*cells)
+        table.add_row(cells[0], *(cells[1 + points.index(each)] for each in shown), cells[-2])
     return table
 
 
