@@ -11,7 +11,8 @@ from torch import Tensor
 
 from popl_rl.config import Config
 from popl_rl.data.tables import Table, policy_return, solve
-from popl_rl.experiments.people import People, catered_members, split
+from popl_rl.experiments.people import People, split
+from popl_rl.experiments.people_training import catered_members
 from popl_rl.keys import REWARD
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.policies import PolicySpec
