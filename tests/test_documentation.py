@@ -19,7 +19,12 @@ ROOT = Path(__file__).parents[1]
 READMES = [Path(f, "README.md") for f in ("", "popl_rl", "envs", "trainers", "configs", "tests")]
 PAGES = [*READMES, *(Path(".github", name) for name in ("CONTRIBUTING.md", "CHANGELOG.md"))]
 TEXT = {page: (ROOT / page).read_text(encoding="utf-8") for page in PAGES}
-CONFIGS = {"popl-train": "train", "popl-evaluate": "evaluate", "popl-benchmark": "benchmark"}
+CONFIGS = {
+    "popl-train": "train",
+    "popl-evaluate": "evaluate",
+    "popl-benchmark": "benchmark",
+    "popl-people": "people",
+}
 NOT_TRAINING = ("method.popl.", "method.refinement.", "method.mixture.")
 
 
@@ -140,7 +145,7 @@ def documented_settings(section):
     return [name for cell in cells for name in re.findall(r"`([\w.]+)`", cell)]
 
 
-@pytest.mark.parametrize("section", ["raters", "data", "method", "evaluation"])
+@pytest.mark.parametrize("section", ["raters", "data", "method", "people", "evaluation"])
 def test_every_setting_is_documented_and_exists(section):
     existing = set(settings_of(getattr(Config(), section)))
     named = documented_settings(section)

@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("folder", type=Path, help="folder to write; '-' to look only")
     parser.add_argument("option", nargs="*", help="name=value of the reader, or of encode=")
     parser.add_argument("--reader", help="table, npz, chosen, folder or a reference; by itself")
-    given = parser.parse_args(arguments)
+    given = parser.parse_intermixed_args(arguments)
     try:
         options = read_options(given.option)
         encode = options.pop("encode", None)

@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("setting", nargs="*", help="overrides, such as people.folds=3")
     parser.add_argument("--out", type=Path, help="folder of the study; runs/study-<name>")
     parser.add_argument("--encode", default="tfidf", help="tfidf, or a language model's folder")
-    given = parser.parse_args(arguments)
+    given = parser.parse_intermixed_args(arguments)
     out = given.out or Path("runs", f"study-{given.study}")
     try:
         if given.study == "arguments":
