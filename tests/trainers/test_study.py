@@ -22,6 +22,7 @@ SHORT = [
 ]
 
 
+@pytest.mark.slow
 def test_a_study_of_the_delivery_grid(tmp_path, capsys):
     """16 people, half of whom look at what is collected, half at whether the goal is neared."""
     grid, rng = DeliveryGrid(), np.random.default_rng(0)
@@ -70,6 +71,7 @@ def test_a_study_of_the_delivery_grid(tmp_path, capsys):
     assert "How many further answers" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_study_of_arguments(tmp_path):
     rng = np.random.default_rng(1)
     words = ["tea", "milk", "sun", "rain", "fish", "tree"]
