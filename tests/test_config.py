@@ -83,8 +83,8 @@ CASES = [
      "env.mixture must be non-negative shares that sum to 1, got {'a': 1.5, 'b': -0.5}"),
     ("env__mixture", {}, "env.mixture must be non-negative shares that sum to 1, got {}"),
     ("raters__groups", [],
-     "raters.groups must be one or more rater references, unless people's answers are in data.load, "
-     "got []"),
+     "raters.groups must be one or more rater references, unless people's answers are in "
+     "data.load, got []"),
     ("raters__groups", ["upper", "upper"],
      "raters.groups must be different groups, got ['upper', 'upper']"),
     ("raters__shares", [1.0], "raters.shares must be one number per group (2), got [1.0]"),
