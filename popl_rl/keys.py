@@ -8,6 +8,7 @@ Segments, batch size ``[N]`` (N segments of T steps):
 | ``action`` | ``[N, T]`` or ``[N, T, A]`` | int64 or float32 | what was done |
 | ``reward`` | ``[N, T]`` | float32 | the environment's own reward, for raters that use it |
 | ``("info", name)`` | ``[N, T]`` | float32 or int64 | each number of the ``info`` |
+| ``mask`` | ``[N, T]`` | bool | optional: steps that there are, where segments differ in length |
 | ``("info", "start")`` | ``[N, T]`` | int64 | which segments may be compared, see ``START`` |
 
 Preferences, batch size ``[M]``:
@@ -16,9 +17,11 @@ Preferences, batch size ``[M]``:
 |---|---|---|---|
 | ``pair`` | ``[M, 2]`` | int64 | rows of the two segments that were compared |
 | ``answer`` | ``[M]`` | int64 | an ``Answer`` |
-| ``rater`` | ``[M]`` | int64 | id of the person who answered |
+| ``rater`` | ``[M]`` | int64 | id of the person who answered; -1 where it is unknown |
+| ``chance`` | ``[M]`` | float32 | optional soft label: how likely the second is preferred |
 | ``("hidden", "group")`` | ``[M]`` | int64 | group of that person. For evaluation only |
 | ``("hidden", "utility")`` | ``[M, 2]`` | float32 | utility of each segment. For evaluation only |
+| ``("hidden", "condition")`` | ``[M]`` | int64 | what people were told. For evaluation only |
 """
 
 from enum import IntEnum
@@ -29,12 +32,15 @@ OBSERVATION = "observation"
 ACTION = "action"
 REWARD = "reward"
 INFO = "info"
+MASK = "mask"
 PAIR = "pair"
 ANSWER = "answer"
 RATER = "rater"
+CHANCE = "chance"
 HIDDEN = "hidden"
 GROUP = (HIDDEN, "group")
 UTILITY = (HIDDEN, "utility")
+CONDITION = (HIDDEN, "condition")
 #: Optional number of the state that a segment goes on from. Where it is given, only segments from
 #: the same state are compared: of two clips that begin alike, what differs is what was done.
 START = (INFO, "start")

@@ -83,7 +83,9 @@ CASES = [
     ("env__mixture", {"a": 1.5, "b": -0.5},
      "env.mixture must be non-negative shares that sum to 1, got {'a': 1.5, 'b': -0.5}"),
     ("env__mixture", {}, "env.mixture must be non-negative shares that sum to 1, got {}"),
-    ("raters__groups", [], "raters.groups must be one or more rater references, got []"),
+    ("raters__groups", [],
+     "raters.groups must be one or more rater references, unless people's answers are in "
+     "data.load, got []"),
     ("raters__groups", ["upper", "upper"],
      "raters.groups must be different groups, got ['upper', 'upper']"),
     ("raters__shares", [1.0], "raters.shares must be one number per group (2), got [1.0]"),
@@ -253,8 +255,13 @@ CHOICES = sorted(
 
 
 @pytest.mark.parametrize("choice", CHOICES)
-def test_every_choice_fits_its_schema_and_is_valid(choice, config_of):
+def test_every_choice_fits_its_schema_and_is_valid(choice, config_of, tmp_path):
     config = config_of(choice)
+    if choice == "raters=people":
+        with pytest.raises(ValueError, match=r"unless people's answers are in data\.load"):
+            validate(config)
+        (tmp_path / "segments").mkdir()
+        config.data.load = str(tmp_path)
     must_be_given = {
         "env=gym": ("id", "CartPole-v1"),
         "env=custom": ("factory", "my_env.py:make"),
@@ -265,6 +272,18 @@ def test_every_choice_fits_its_schema_and_is_valid(choice, config_of):
             validate(config)
         config.env[name] = value
     validate(config)
+
+
+STUDIES = sorted(path.stem for path in (FOLDER / "study").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("study", STUDIES)
+def test_every_study_fits_the_schema_of_people(study, config_of, tmp_path):
+    (tmp_path / "segments").mkdir()
+    config = config_of(f"study={study}", f"data.load={tmp_path}", name="people")
+    validate(config)
+    assert config.method.refinement.rewards
+    assert list(config.raters.groups) == []
 
 
 def test_an_environment_can_name_raters_of_its_own(config_of):

@@ -27,6 +27,7 @@ CONFIGS = {
     "popl-benchmark": "benchmark",
     "popl-label": "label",
     "popl-serve": "serve",
+    "popl-people": "people",
 }
 NOT_TRAINING = ("method.popl.", "method.refinement.", "method.mixture.")
 
@@ -151,7 +152,7 @@ def documented_settings(section):
 @pytest.mark.parametrize(
     ("schema", "section"),
     [
-        *((Config, section) for section in ("raters", "data", "method", "evaluation")),
+        *((Config, section) for section in ("raters", "data", "method", "people", "evaluation")),
         (LabelConfig, "label"),
         (LabelConfig, "page"),
         (ServeConfig, "serve"),

@@ -3,10 +3,11 @@
 import logging
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.resources import files
 from typing import Any
 
+import yaml
 from hydra.core.config_store import ConfigStore
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
@@ -24,7 +25,7 @@ from popl_rl.config import (
 )
 from popl_rl.trainers.spelling import explained
 
-__all__ = ["USER_ERRORS", "prepare", "register_schemas", "run_command"]
+__all__ = ["USER_ERRORS", "prepare", "read_options", "register_schemas", "run_command"]
 
 #: Errors that mean the user can put it right; anything else is a defect and keeps its traceback.
 USER_ERRORS = (HydraException, OmegaConfBaseException, ValueError, TypeError, OSError)
@@ -84,6 +85,24 @@ def prepare(config: Any) -> Config:
     if problems:
         raise ValueError("settings that nobody reads:\n  " + "\n  ".join(problems))
     return settings
+
+
+def read_options(given: Sequence[str]) -> dict[str, Any]:
+    """Options of a command as a dictionary; values are read as YAML reads them.
+
+    Args:
+        given: Texts ``name=value``.
+
+    Raises:
+        ValueError: If a text is none such.
+    """
+    found: dict[str, Any] = {}
+    for text in given:
+        name, equals, value = text.partition("=")
+        if not equals or not name:
+            raise ValueError(f"options must be name=value, got {text!r}")
+        found[name] = yaml.safe_load(value) if value else None
+    return found
 
 
 def _given() -> list[str]:

@@ -47,6 +47,8 @@ def run(config: Config) -> Result:
     from popl_rl.experiments import steps
 
     config, run_dir = steps.open_run(config, command=sys.argv)
+    if not config.raters.groups:
+        return _run_people(config, run_dir)
 
     # 1. World, raters, and what they say.
     setting = steps.gather(config, run_dir)
@@ -67,16 +69,49 @@ def run(config: Config) -> Result:
     return Result(run_dir, found, board)
 
 
+def _run_people(config: Config, run_dir: Path) -> Result:
+    """Learn from real people's answers, and judge by people who were held out."""
+    from popl_rl.evaluation.results import Scoreboard
+    from popl_rl.experiments import people_steps, steps
+    from popl_rl.experiments.people import split
+
+    # 1. What people said, and who of them is held out.
+    people = people_steps.read_people(config, run_dir)
+    fold = split(people, config.people, 0, ties=config.method.ties, seed=config.seed)
+
+    # 2. The population, evolved.
+    with steps.open_logger(config, run_dir) as logger:
+        trained = people_steps.evolve_people(config, people, fold, run_dir, logger)
+        assert trained.found is not None
+        steps.save_anew(trained.found, run_dir / trained.found.folder)
+
+    # 3. Judged by the people held out, beside one hypothesis for all and one for each person.
+    table = people_steps.compare_methods(
+        config,
+        people,
+        methods=[*people_steps.REFERENCES, config.method.name],
+        folds=[0],
+        cells=run_dir / "cells",
+        known=lambda name, _: trained if name == config.method.name else None,
+    )
+    title = f"{config.method.name} on real people"
+    results = people_steps.finish_people(config, people, table, run_dir, title=title)
+    return Result(run_dir, trained.found, Scoreboard(results, {}, {}, config.method.name))
+
+
 def show(result: Result) -> None:
     """Print the table and where everything is."""
     from rich.console import Console
 
     from popl_rl.evaluation.diagnostics import alarm
+    from popl_rl.experiments.people_report import people_alarm, people_table
     from popl_rl.experiments.report import results_table
 
     console = Console()
-    console.print(results_table(result.board.results))
-    warning = alarm(result.board.results)
+    results = result.board.results
+    of_people = bool(results["measure"].str.startswith("accuracy@0").any())
+    console.print(people_table(results) if of_people else results_table(results))
+    warning = people_alarm(results, result.board.label) if of_people else alarm(results)
     if warning is not None:
         console.print(f"alarm: {warning}", style="bold red", highlight=False, soft_wrap=True)
     console.print(f"report, pictures, policies and logs: {result.run_dir}", soft_wrap=True)
@@ -89,7 +124,8 @@ register_schemas()
 def main(cfg: Any) -> None:
     """Hydra's entry."""
     config = prepare(cfg)
-    method, env = config.method.name, config.env.factory
+    method = config.method.name
+    env = config.env.factory if config.raters.groups else str(config.data.load)
     # Loading PyTorch takes seconds, in which a person should know that something goes on.
     sys.stderr.write(f"{method} in {env}, seed {config.seed}: loading PyTorch\n")
     show(run(config))

@@ -18,6 +18,10 @@ from popl_rl.selection.rules import SELECTIONS, Selection, selection_rule
 
 __all__ = ["build_popl", "kind_of_variation"]
 
+#: Raters up to whom each is compared with each: a matrix of 1.6 GB. With more, children learn from
+#: the raters that their parents are strong for, whoever these are.
+_MOST_SIMILAR = 20_000
+
 
 def kind_of_variation(settings: POPLSettings, problem: Problem) -> str:
     """The kind that ``auto`` stands for: gradient with rater ids, mixtures without."""
@@ -91,7 +95,8 @@ def _gradient(
     population = _first_heads(problem, popl, generator)
     variation = GradientCPL.of(problem, population, generator=generator)
     has_ids = not problem.comparisons.is_single
-    if not (popl.rater_similarity and has_ids):
+    few = problem.comparisons.num_cases <= _MOST_SIMILAR
+    if not (popl.rater_similarity and has_ids and few):
         variation.warm_up(popl.warm_up)
         return POPL(problem, population=population, variation=variation, **options)
     if problem.evolve == "head":
@@ -107,8 +112,8 @@ def _gradient(
         learning_rate=problem.training.learning_rate / 2,
         generator=generator,
     )
-    # It has not been tried for heads and reward functions.
-    tried = problem.evolve == "all" and problem.spec.refines
+    # It has not been tried for heads, and for reward functions with real people alone.
+    tried = problem.evolve == "all" and (problem.spec.refines or refinement.rewards)
     return POPL(
         problem,
         population=population,

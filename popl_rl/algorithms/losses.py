@@ -122,8 +122,11 @@ class CPLLoss(LossModule):
                 value = population.spec.step_scores(output, action)
         else:
             value = population.spec.step_scores(population(bank.observation[row]), action)
-        steps = torch.arange(bank.row.shape[1], device=value.device).float()
-        scores: Tensor = value.view(*segment.shape, -1) @ (self.alpha * self.discount**steps)
+        value = value.view(*segment.shape, -1)
+        weight = self.alpha * bank.weights(segment, discount=self.discount)
+        if weight.ndim > 1:
+            return (value * weight).sum(-1)
+        scores: Tensor = value @ weight
         return scores
 
     def _loss(self, preferred: Tensor, other: Tensor) -> Tensor:
@@ -178,13 +181,17 @@ def descend(
         steps: Number of steps.
         batch_size: Preferences per member and step, drawn with replacement.
         weight: How often each member draws each preference, ``[N, M]``, non-negative, each row
-            with a positive entry. Uniform if None.
+            with a positive entry. Uniform if None. The comparisons' own weights count besides.
         generator: Source of the draws.
 
     Returns:
         The last step's loss, averaged over members.
     """
     count, device = len(loss.population), comparisons.preferred.device
+    if weight is not None:
+        weight = comparisons.weighted(weight)
+    elif comparisons.weight is not None:
+        weight = comparisons.weight.expand(count, -1)
     value = torch.tensor(float("nan"))
     for _ in range(steps):
         if weight is None:

@@ -313,7 +313,6 @@ def _visit_counts(bank: SegmentBank, spec: Spec, discount: float) -> Tensor | No
     if not (bank.is_shared and spec.discrete):
         return None
     cells = len(bank.observation) * spec.action_dim
-    steps = torch.arange(bank.row.shape[1], device=bank.row.device)
-    weight = (discount**steps).float().expand(bank.row.shape)
+    weight = bank.weights(slice(None), discount=discount).expand(bank.row.shape)
     counts = torch.zeros(len(bank), cells, device=bank.row.device)
     return counts.scatter_add(1, bank.row * spec.action_dim + bank.action, weight)

@@ -37,8 +37,9 @@ def nested_subsets(likelihood: Tensor, comparisons: Comparisons) -> Nested:
     Returns:
         The subsets, up to all K members.
     """
-    others = per_case(likelihood, comparisons)[:, comparisons.case] - likelihood
-    count = comparisons.case.bincount(minlength=comparisons.num_cases).clamp(min=1)
+    own = comparisons.per_answer(likelihood)
+    others = per_case(likelihood, comparisons)[:, comparisons.case] - own
+    count = comparisons.sizes().clamp(min=1e-6)
     order: list[int] = []
     values = []
     strongest = torch.full_like(others[0], -torch.inf)

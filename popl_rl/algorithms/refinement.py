@@ -36,7 +36,7 @@ def predictive(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
     Returns:
         Mean log-likelihood of each case's answers, ``[C]``.
     """
-    count = comparisons.case.bincount(minlength=comparisons.num_cases).clamp(min=1)
+    count = comparisons.sizes().clamp(min=1e-6)
     mean: Tensor = per_case(leave_one_out(likelihood, comparisons), comparisons) / count
     return mean
 
@@ -175,7 +175,10 @@ class _CrossFitting:
         for _ in range(steps):
             index = torch.randint(len(comparisons), shape, generator=self.generator, device=device)
             losses = self.loss.pairs(comparisons.preferred[index], comparisons.other[index])
-            loss = (losses * self.weight[:, index]).mean(1).sum()
+            weight = self.weight[:, index]
+            if comparisons.weight is not None:
+                weight = weight * comparisons.weight[index]
+            loss = (losses * weight).mean(1).sum()
             self.optimizer.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]
             self.optimizer.step()

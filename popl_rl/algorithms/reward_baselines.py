@@ -49,7 +49,10 @@ def segment_features(trunk: torch.nn.Module, bank: SegmentBank, action_dim: int)
     total = torch.zeros(size * action_dim, width, device=features.device)
     segment = torch.arange(size, device=features.device).unsqueeze(1)
     target = (segment * action_dim + bank.action).flatten()
-    total.index_add_(0, target, features[bank.row.flatten()])
+    values = features[bank.row.flatten()]
+    if bank.mask is not None:
+        values = values * bank.mask.flatten().unsqueeze(1)
+    total.index_add_(0, target, values)
     return total.view(size, -1)
 
 

@@ -10,7 +10,7 @@ raters.
 
 import copy
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -18,9 +18,10 @@ from torch import Tensor
 from popl_rl.algorithms.losses import cpl_loss
 from popl_rl.algorithms.problem import Problem
 from popl_rl.config import VPLSettings
-from popl_rl.models.encoded_policy_set import AnswerEncoder, EncodedPolicySet
+from popl_rl.models.encoded_policy_set import AnswerEncoder, EncodedPolicySet, EncodedRewardSet
 from popl_rl.models.policies import PolicySpec, build_network
 from popl_rl.models.population import Population
+from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.models.schedules import linear_decay
 from popl_rl.models.scoring import case_values, rater_accuracy
 from popl_rl.selection.farthest_first import farthest_first
@@ -74,15 +75,15 @@ class VPL:
         generations: Generations after which it is finished.
 
     Raises:
-        ValueError: If hypotheses are no policies, or style codes, every case is one preference,
-            ``latent`` is below 1 or ``kl`` negative.
+        ValueError: If hypotheses have no bias that z could be, or style codes, every case is one
+            preference, ``latent`` is below 1 or ``kl`` negative.
     """
 
     def __init__(self, problem: Problem, *, vpl: VPLSettings, generator: torch.Generator) -> None:
-        if not isinstance(problem.spec, PolicySpec):
+        if not problem.spec.hidden and not problem.spec.output_bias:
             raise ValueError(
-                "method vpl learns policies, not reward functions; choose another method, or set "
-                "method.learns=policy where there is something to do"
+                "method vpl needs a hidden layer, to whose inputs z is added; set method.hidden, "
+                "such as method.hidden=[32]"
             )
         if problem.clone is not None or problem.evolve != "all":
             raise ValueError(
@@ -97,8 +98,8 @@ class VPL:
             raise ValueError(f"vpl.latent must be at least 1, got {vpl.latent}")
         if not vpl.kl >= 0:
             raise ValueError(f"vpl.kl must be at least 0, got {vpl.kl}")
-        self.problem, self.spec = problem, problem.spec
-        self.kl, self.answers = vpl.kl, vpl.answers
+        self.problem, self.spec = problem, cast("PolicySpec | RewardSpec", problem.spec)
+        self.kl, self.answers, self.latent = vpl.kl, vpl.answers, vpl.latent
         self.raters = max(1, problem.training.batch_size // vpl.answers)
         self.generator = generator
         self.generation, self.generations = 0, problem.generations
@@ -140,7 +141,7 @@ class VPL:
         rater = torch.randint(
             said.num_cases, (self.raters,), generator=source, device=self.problem.device
         )
-        mine = (said.case == rater.unsqueeze(1)).float()
+        mine = said.weighted((said.case == rater.unsqueeze(1)).float())
         index = torch.multinomial(mine, self.answers, replacement=True, generator=source)
         preferred, other = said.preferred[index], said.other[index]
         mean, log_std = self.encoder(self.problem.bank, preferred, other)
@@ -159,8 +160,10 @@ class VPL:
         wants = z[:, None, None].expand(*observation.shape[:-1], -1)
         output = self.network(torch.cat([observation, wants], -1))
         step = self.spec.step_scores(output, bank.action[segment])
-        time = torch.arange(step.shape[-1], device=step.device)
-        scores: Tensor = step @ (recipe.alpha * recipe.discount ** time.float())
+        weight = recipe.alpha * bank.weights(segment, discount=recipe.discount)
+        if weight.ndim > 1:
+            return (step * weight).sum(-1)
+        scores: Tensor = step @ weight
         return scores
 
     @torch.no_grad()
@@ -193,11 +196,12 @@ class VPL:
         """The policies of the set as it is now."""
         return self.policies_for(self._z())
 
-    def result(self) -> EncodedPolicySet:
-        """A set of policies for what different raters want."""
+    def result(self) -> EncodedPolicySet | EncodedRewardSet:
+        """A set of hypotheses for what different raters want."""
         z = self._z()
         encoder = copy.deepcopy(self.encoder).requires_grad_(False)
-        return EncodedPolicySet(
+        kind = EncodedPolicySet if isinstance(self.spec, PolicySpec) else EncodedRewardSet
+        return kind(
             self.policies_for(z),
             encoder=encoder,
             z=z,

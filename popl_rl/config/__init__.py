@@ -1,9 +1,9 @@
 """Settings, with their defaults and what they mean. Imports neither torch nor TorchRL.
 
 ``data``: environment, raters and segments; ``method``: methods, a section for each part;
-``evaluation``: how the result is evaluated; ``run``: a whole run; ``stored``: those of an earlier
-run; ``pages``: what people answer on; ``checks``: how they check themselves; ``unread``: settings
-that the chosen method does not read.
+``evaluation``: how the result is evaluated; ``people``: likewise, by held-out real people; ``run``:
+a whole run; ``stored``: those of an earlier run; ``pages``: what people answer on; ``checks``: how
+they check themselves; ``unread``: settings that the chosen method does not read.
 """
 
 from popl_rl.config.checks import Checker, parse_epsilon
@@ -28,6 +28,7 @@ from popl_rl.config.pages import (
     ServeConfig,
     ServeSettings,
 )
+from popl_rl.config.people import PeopleConfig
 from popl_rl.config.run import Config, EvaluateConfig, LoggerConfig, plain, validate
 from popl_rl.config.stored import load_config
 from popl_rl.config.unread import unread
@@ -50,6 +51,7 @@ __all__ = [
     "NicheSettings",
     "POPLSettings",
     "PageSettings",
+    "PeopleConfig",
     "RatersConfig",
     "RefinementSettings",
     "ResponseConfig",

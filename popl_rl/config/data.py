@@ -60,7 +60,8 @@ class ResponseConfig:
 class RatersConfig:
     """Who is asked, and what they want."""
 
-    groups: list[str] = field(default_factory=list)  # references of rater functions
+    groups: list[str] = field(default_factory=list)  # references of rater functions; empty where
+    # real people have answered (data.load)
     shares: list[float] | None = None  # chance of each group; equal if null
     count: int = 200  # raters
     answers: int = 20  # answers of each
@@ -70,7 +71,6 @@ class RatersConfig:
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
         at.at_least_one(self, "count", "answers")
-        at.expect(bool(self.groups), "groups", "one or more rater references", self.groups)
         repeated = len(set(self.groups)) < len(self.groups)
         at.expect(not repeated, "groups", "different groups", self.groups)
         if self.shares is not None:
@@ -91,6 +91,8 @@ class DataConfig:
     memmap: str | None = None  # folder for memory-mapped storage; in memory if null
     load: str | None = None  # folder 'data' of an earlier run: its segments and preferences
     reader: str | None = None  # reference of kind reader, for other data in load; null for a folder
+    # of ours, or the reader that fits a file
+    reader_options: dict[str, Any] = field(default_factory=dict)  # further arguments of the reader
     save: bool = True  # keep segments and preferences in the run folder
     store: str | None = None  # folder in which segments are kept for other runs; none if null
     seed: int | None = None  # of the segments; that of the run if null
@@ -101,7 +103,7 @@ class DataConfig:
         at.expect(self.segments >= 2, "segments", "at least 2, to compare", self.segments)
         if self.load is not None:
             folder = "the folder 'data' of an earlier run, or other data with data.reader"
-            found = (Path(self.load) / "segments").is_dir()
+            found = (Path(self.load) / "segments").is_dir() or Path(self.load).is_file()
             if self.reader is not None:
                 folder, found = "something that the reader can read", Path(self.load).exists()
             at.expect(found, "load", folder, self.load)

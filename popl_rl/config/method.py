@@ -77,6 +77,7 @@ class RefinementSettings:
     steps: int = 1500  # CPL steps; 0 for none (policies, gradient variation, rater ids)
     folds: int = 4  # folds of the cross-fitting
     most: int = 8  # members to begin with, at most
+    rewards: bool = False  # refine reward functions too
 
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
@@ -201,6 +202,7 @@ class MethodConfig:
     needs_ids: bool = False  # whether the method lives on rater ids
     learns: str = "auto"  # policy, reward; auto: reward where there is nothing to do but judge
     cases: str = "rater"  # what lexicase filters on: rater (needs rater ids) or preference
+    ties: str = "drop"  # ties and soft labels: drop, or count by halves (needs rater ids)
     evolve: str = "all"  # all: whole networks; head: last layers on a shared, frozen trunk; code:
     # style codes fed to a network that was cloned from the data's behaviour and is frozen
     hidden: list[int] = field(default_factory=lambda: [64, 64])  # units of each hidden layer
@@ -232,6 +234,7 @@ class MethodConfig:
         at.expect(not unknown, "reads", f"sections out of {', '.join(SECTIONS)}", unknown)
         at.one_of(self, "learns", ("auto", "policy", "reward"))
         at.expect(self.cases in ("rater", "preference"), "cases", "rater or preference", self.cases)
+        at.one_of(self, "ties", ("drop", "count"))
         at.one_of(self, "evolve", ("all", "head", "code"))
         at.at_least_one(self, "members", "generations")
         at.expect(all(units >= 1 for units in self.hidden), "hidden", "positive", self.hidden)

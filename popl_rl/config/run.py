@@ -9,6 +9,7 @@ from popl_rl.config.checks import Checker
 from popl_rl.config.data import DataConfig, EnvConfig, RatersConfig
 from popl_rl.config.evaluation import EvaluationConfig
 from popl_rl.config.method import MethodConfig
+from popl_rl.config.people import PeopleConfig
 
 __all__ = ["Checked", "Config", "EvaluateConfig", "LoggerConfig", "plain", "validate"]
 
@@ -58,6 +59,7 @@ class Config:
     data: DataConfig = field(default_factory=DataConfig)
     method: MethodConfig = field(default_factory=MethodConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    people: PeopleConfig = field(default_factory=PeopleConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     seed: int = 0
     device: str = "cpu"  # where policies are trained: cpu or cuda
@@ -68,8 +70,11 @@ class Config:
 
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
-        for name in ("env", "raters", "data", "method", "evaluation", "logger"):
+        for name in ("env", "raters", "data", "method", "evaluation", "people", "logger"):
             getattr(self, name).check(at.below(name))
+        from_people = bool(self.raters.groups) or self.data.load is not None
+        cure = "one or more rater references, unless people's answers are in data.load"
+        at.expect(from_people, "raters.groups", cure, self.raters.groups)
         proper = self.device.split(":")[0] in ("cpu", "cuda")
         at.expect(proper, "device", "cpu or cuda", self.device)
         at.at_least_one(self, "threads", "checkpoint_interval")

@@ -4,5 +4,6 @@
 * ``behaviours``: who acts while data are collected; ``rollouts``: whole episodes in lockstep.
 * ``segments``: episodes cut into segments; ``store``: segments that several runs share.
 * ``pairs``: random pairs of segments that may be compared.
+* ``readers``: other people's data, from csv, jsonl, parquet, npz, Minari, chosen and rejected.
 * ``bank``: segments as scoring reads them; ``comparisons``: preferences as learning reads them.
 """

@@ -1,12 +1,13 @@
-"""Strict preferences in the form a learner reads: no group, no utility, no rater model."""
+"""Preferences in the form a learner reads: no group, no utility, no rater model."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from popl_rl.keys import ANSWER, PAIR, RATER, Answer
+from popl_rl.keys import ANSWER, CHANCE, PAIR, RATER, Answer
 
 __all__ = ["Comparisons"]
 
@@ -15,12 +16,19 @@ __all__ = ["Comparisons"]
 class Comparisons:
     """Strict preferences as a learner reads them; hidden keys are never looked at.
 
+    A tie that counts, and an answer with a soft label, are two comparisons, one each way, whose
+    weights sum to 1: the cross-entropy of a label in [0, 1] (Christiano et al., 2017, section
+    2.2.3). They are comparisons of the same case.
+
     Attributes:
         preferred: Segment that was preferred, ``[M]``.
         other: Segment it was preferred to, ``[M]``.
         case: What lexicase filters on: the rater's number, or the preference's own, ``[M]``.
         num_cases: Number of cases C.
         num_dropped: Ties and skips that were left out.
+        weight: How much each comparison counts, ``[M]`` in (0, 1]; None if all count 1.
+        answer: Number of the answer that each comparison is of, ``[M]``, the same for the two
+            comparisons of one answer; None if every comparison is an answer.
     """
 
     preferred: Tensor
@@ -28,6 +36,8 @@ class Comparisons:
     case: Tensor
     num_cases: int
     num_dropped: int = 0
+    weight: Tensor | None = None
+    answer: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.preferred)
@@ -37,44 +47,82 @@ class Comparisons:
         """Whether every case is a single preference, as where nobody kept rater ids."""
         return self.num_cases == len(self)
 
+    def weighted(self, value: Tensor) -> Tensor:
+        """Values of comparisons ``[..., M]`` times how much each counts."""
+        return value if self.weight is None else value * self.weight
+
+    def sizes(self) -> Tensor:
+        """Comparisons of each case, by their weights, ``[C]``."""
+        return self.case.bincount(self.weight, minlength=self.num_cases)
+
     @classmethod
-    def from_preferences(cls, preferences: TensorDictBase, *, cases: str) -> "Comparisons":
-        """Keep the strict answers.
+    def from_preferences(
+        cls,
+        preferences: TensorDictBase,
+        *,
+        cases: str,
+        ties: Literal["drop", "count"] = "drop",
+    ) -> "Comparisons":
+        """Keep the strict answers; or also ties and soft labels, as what they say.
 
         Args:
             preferences: TensorDict ``[M]`` with ``pair``, ``answer`` and, for rater cases,
-                ``rater``.
+                ``rater``. A rater of -1 is unknown: each such answer is a case of its own.
             cases: ``"preference"`` or ``"rater"``.
+            ties: ``"drop"``: ties are left out, soft labels count as the answer that they are
+                nearer to. ``"count"``: both count by halves, or by their ``chance``; with a case
+                for each rater only, since halves of one answer are no cases.
 
         Returns:
             The M' strict ones, each with its case; raters' cases are numbered from 0.
 
         Raises:
-            ValueError: If ``cases`` is neither, rater ids are needed and missing, or no answer is
-                strict.
+            ValueError: If ``cases`` or ``ties`` is none of these, rater ids are needed and
+                missing, or no answer is strict.
         """
         if cases not in ("preference", "rater"):
             raise ValueError(f"cases must be 'preference' or 'rater', got {cases!r}")
+        if ties not in ("drop", "count"):
+            raise ValueError(f"ties must be 'drop' or 'count', got {ties!r}")
         if cases == "rater" and RATER not in preferences.keys():  # noqa: SIM118 - not a dict
             raise ValueError(
                 "preferences must hold 'rater', the id of who answered, for cases='rater'; without "
                 "ids use cases='preference'"
             )
         answer = preferences[ANSWER]
-        strict = answer <= Answer.SECOND
-        if not strict.any():
+        counting = ties == "count" and cases == "rater"
+        kept = answer <= (Answer.TIE if counting else Answer.SECOND)
+        if not (answer <= Answer.SECOND).any():
             raise ValueError(
                 f"preferences must hold a strict answer, got {len(answer)} ties and skips; lower "
                 "the raters' tie and skip thresholds or ask about more different segments"
             )
-        pair, side = preferences[PAIR][strict], answer[strict].unsqueeze(-1)
+        pair, said = preferences[PAIR][kept], answer[kept]
+        soft = preferences.get(CHANCE, None)
+        chance = torch.where(said == Answer.TIE, 0.5, said.float())
+        if counting and soft is not None:
+            chance = soft[kept]
+        side = (chance >= 0.5).long().unsqueeze(-1)
         preferred = pair.gather(-1, side).squeeze(-1)
         other = pair.gather(-1, 1 - side).squeeze(-1)
         if cases == "preference":
             case = torch.arange(len(preferred), device=pair.device)
         else:
-            case = preferences[RATER][strict].unique(return_inverse=True)[1]
-        return cls(preferred, other, case, int(case.max()) + 1, int((~strict).sum()))
+            case = _named(preferences[RATER][kept]).unique(return_inverse=True)[1]
+        count, dropped = int(case.max()) + 1, int((~kept).sum())
+        doubt = torch.minimum(chance, 1 - chance)
+        unsure = (doubt > 0).nonzero().squeeze(-1)
+        if not len(unsure):
+            return cls(preferred, other, case, count, dropped)
+        return cls(
+            torch.cat([preferred, other[unsure]]),
+            torch.cat([other, preferred[unsure]]),
+            torch.cat([case, case[unsure]]),
+            count,
+            dropped,
+            torch.cat([1 - doubt, doubt[unsure]]),
+            torch.cat([torch.arange(len(preferred), device=pair.device), unsure]),
+        )
 
     def to(self, device: torch.device | str) -> "Comparisons":
         """The same comparisons on another device."""
@@ -84,10 +132,35 @@ class Comparisons:
             self.case.to(device),
             self.num_cases,
             self.num_dropped,
+            None if self.weight is None else self.weight.to(device),
+            None if self.answer is None else self.answer.to(device),
         )
 
     def rows(self, index: Tensor) -> "Comparisons":
         """Some of the comparisons; cases keep their numbers, and nothing counts as dropped."""
         return Comparisons(
-            self.preferred[index], self.other[index], self.case[index], self.num_cases
+            self.preferred[index],
+            self.other[index],
+            self.case[index],
+            self.num_cases,
+            0,
+            None if self.weight is None else self.weight[index],
+            None if self.answer is None else self.answer[index].unique(return_inverse=True)[1],
         )
+
+    def per_answer(self, value: Tensor) -> Tensor:
+        """Weighted sums over the comparisons of the same answer, at each of them, ``[..., M]``."""
+        value = self.weighted(value)
+        if self.answer is None:
+            return value
+        total = value.new_zeros(*value.shape[:-1], int(self.answer.max()) + 1)
+        return total.index_add_(-1, self.answer, value)[..., self.answer]
+
+
+def _named(rater: Tensor) -> Tensor:
+    """Raters, with a number of its own for everybody unknown (-1), after the known ones."""
+    unknown = rater < 0
+    if not bool(unknown.any()):
+        return rater
+    own = int(rater.max()) + 1 + unknown.cumsum(0)
+    return torch.where(unknown, own, rater)

@@ -5,6 +5,8 @@
 - What that is worth: ``measures`` of episodes and rankings, ``optimum`` with exact returns,
   ``best_of_set`` and its worth in ``hindsight``, ``held_out_raters`` and ``ranking_agreement``; by
   the number of answers, to drawn or to ``chosen_questions``, in ``catering_curves``.
+- Real people: ``people`` who are held out, ``people_models`` of each of them, and
+  ``people_statistics``.
 - What is told: ``evaluator`` fills the ``results`` of a run by a ``protocol``, ``diagnostics`` puts
   into words what stands out, ``statistics`` summarises groups and seeds, ``method_names`` says what
   methods are called, and ``suite`` what a benchmark compares.

@@ -44,6 +44,7 @@ METHODS = {
     "brex": ReportedMethod("B-REX", "", True),
     "dpl_mean_variance": ReportedMethod("DPL, mean and variance", "", True),
     "dpl_categorical": ReportedMethod("DPL, categorical", "", True),
+    "individual": ReportedMethod("one model for each person", "", True),
     "oracle": ReportedMethod("oracle (told the groups)", "black", True),
     "clone": ReportedMethod("clone of the data", "", True),
     "random": ReportedMethod("random actions", "", True),
@@ -55,6 +56,9 @@ CHOICES = {
     "posterior": " (catered)",
     "information_gain": " (catered, questions chosen)",
     "lexicase": " (catered by lexicase)",
+    "mixture": " (mixture)",
+    "single": " (best single)",
+    "encoder": " (told by its encoder)",
     "expectation": "",
     "risk_averse": ", risk-averse",
 }

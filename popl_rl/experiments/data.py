@@ -15,6 +15,7 @@ from torchrl.data import TensorDictReplayBuffer
 
 from popl_rl.config import DataConfig, EnvConfig, RatersConfig
 from popl_rl.data.environments import World, make_world
+from popl_rl.data.readers.imported import Imported
 from popl_rl.data.segments import collect_segments, segment_buffer, stored_segments
 from popl_rl.data.store import store_path, stored
 from popl_rl.keys import ACTION, GROUP, INFO, OBSERVATION
@@ -40,7 +41,7 @@ __all__ = [
 
 #: Reads other people's data: path -> segments ``[N, T]`` with ``observation`` and ``action``, and
 #: preferences ``[M]`` with ``pair``, ``answer`` and ``rater``.
-Reader = Callable[[Path], tuple[TensorDictBase, TensorDict]]
+Reader = Callable[[Path], tuple[TensorDictBase, TensorDict] | Imported]
 
 #: Beside saved preferences: names of the groups.
 _ABOUT = "about.json"
@@ -259,7 +260,7 @@ def _read(
     reader: Reader, path: Path, config: DataConfig, world: World
 ) -> tuple[TensorDictBase, TensorDict]:
     """Other people's segments and preferences, checked as ours are."""
-    segments, preferences = reader(path)
+    segments, preferences, *_ = reader(path)
     _check_segments(segments, path, config, world)
     check_preferences(preferences, path, num_segments=len(segments))
     return segments, preferences

@@ -152,7 +152,7 @@ class Progress:
 
     Args:
         description: What is going on.
-        total: Number of generations.
+        total: Number of generations; None if nobody knows.
         completed: Generations done before, when a run is resumed.
         console: Where to draw; None for stderr.
 
@@ -162,7 +162,12 @@ class Progress:
     """
 
     def __init__(
-        self, description: str, *, total: int, completed: int = 0, console: Console | None = None
+        self,
+        description: str,
+        *,
+        total: int | None,
+        completed: int = 0,
+        console: Console | None = None,
     ) -> None:
         console = console or Console(stderr=True)
         self._bar = RichProgress(

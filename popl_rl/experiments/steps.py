@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,6 +18,7 @@ from popl_rl.algorithms.trainer import MethodTrainer
 from popl_rl.config import Config, load_config, plain, validate
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.data.environments import World, indexed, is_stateless
+from popl_rl.data.readers.opening import open_data
 from popl_rl.evaluation.diagnostics import diagnostics
 from popl_rl.evaluation.evaluator import Evaluator
 from popl_rl.evaluation.results import Scoreboard
@@ -27,7 +29,7 @@ from popl_rl.experiments.builders import (
     build_spec,
     train_baselines,
 )
-from popl_rl.experiments.data import Data, Reader, build_groups, build_world, make_data
+from popl_rl.experiments.data import Data, build_groups, build_world, make_data
 from popl_rl.experiments.evaluators import make_evaluator
 from popl_rl.experiments.loggers import Progress, RunLogger, make_logger
 from popl_rl.experiments.metrics import MetricsWriter
@@ -57,6 +59,7 @@ __all__ = [
     "log_results",
     "open_logger",
     "open_run",
+    "save_anew",
     "train_references",
     "write_report",
 ]
@@ -141,8 +144,10 @@ def gather(config: Config, run_dir: Path) -> Setting:
     reader = None
     if load is None and config.data.load is not None:
         load = Path(config.data.load)
-        if config.data.reader is not None:
-            reader = cast("Reader", resolve("reader", config.data.reader))
+        if config.data.reader is not None or load.is_file():
+            reader = partial(
+                open_data, reader=config.data.reader, options=config.data.reader_options
+            )
     with Progress("segments", total=config.data.segments) as progress:
         data = make_data(
             config.data,
@@ -159,7 +164,11 @@ def gather(config: Config, run_dir: Path) -> Setting:
         data.save(kept)
     spec = build_spec(config.method, world.env)
     bank = spec.bank(indexed(data.steps, world.env.action_space)).to(config.device)
-    comparisons = Comparisons.from_preferences(data.preferences, cases=config.method.cases)
+    comparisons = Comparisons.from_preferences(
+        data.preferences,
+        cases=config.method.cases,
+        ties=config.method.ties,  # type: ignore[arg-type]
+    )
     clone, typical = None, None
     if config.method.evolve == "code" or config.evaluation.reference == "clone":
         with Progress("cloning", total=config.method.clone.steps) as progress:
@@ -173,7 +182,7 @@ def gather(config: Config, run_dir: Path) -> Setting:
             )
         alone = StyledPopulation(clone, clone.typical().unsqueeze(0))
         typical = as_set(alone, alpha=config.method.training.alpha)
-        _save_anew(typical, run_dir / "clone")
+        save_anew(typical, run_dir / "clone")
     comparisons = comparisons.to(config.device)
     problem = build_problem(config.method, spec, bank, comparisons, clone=clone)
     evaluator = make_evaluator(config, world, groups, data, spec, clone=typical, seed=config.seed)
@@ -223,7 +232,7 @@ def evolve(
         history.truncate_to(done)
         trainer.train()
     found = method.result()
-    _save_anew(found, run_dir / found.folder)
+    save_anew(found, run_dir / found.folder)
     return found
 
 
@@ -241,7 +250,7 @@ def train_references(config: Config, setting: Setting, run_dir: Path) -> Referen
                 generator=stream(config.seed, "baselines", config.device),
                 progress=progress.update,
             )
-        _save_anew(baselines, run_dir / "baselines")
+        save_anew(baselines, run_dir / "baselines")
     if options.reward_baselines and is_stateless(setting.world.env):
         rewards = train_reward_baselines(
             cast("RewardSpec", problem.spec),
@@ -333,7 +342,7 @@ def write_report(
     write_atomic(run_dir / "report.md", text)
 
 
-def _save_anew(found: HypothesisSet, path: Path) -> None:
+def save_anew(found: HypothesisSet, path: Path) -> None:
     """Save a set in the place of what a killed run may have left."""
     shutil.rmtree(path, ignore_errors=True)
     found.save(path)

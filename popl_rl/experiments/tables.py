@@ -2,7 +2,7 @@
 
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,15 @@ import pandas as pd
 from popl_rl.evaluation.statistics import interval, require_columns
 from popl_rl.experiments.markdown import markdown_table
 
-__all__ = ["COLUMNS", "ResultTable", "fill_tables", "make_tables", "read_tables", "rows_for"]
+__all__ = [
+    "COLUMNS",
+    "PeopleTable",
+    "ResultTable",
+    "fill_tables",
+    "make_tables",
+    "read_tables",
+    "rows_for",
+]
 
 #: Columns of the rows of a benchmark.
 COLUMNS = ["suite", "scenario", "seed", "method", "choice", "group", "measure", "value"]
@@ -82,12 +90,85 @@ class ResultTable:
         return markdown_table(head, lines, right=len(self.scenarios))
 
 
-def read_tables(path: Path) -> dict[str, ResultTable]:
+@dataclass(frozen=True)
+class PeopleTable:
+    """Measures of methods on real people: rows are methods, columns groups and measures.
+
+    Attributes:
+        suite: The study whose rows it shows.
+        methods: ``(method, choice)`` -> what the row is called.
+        columns: ``(group, measure)`` -> what the column is called.
+    """
+
+    suite: str
+    methods: Mapping[tuple[str, str], str]
+    columns: Mapping[tuple[str, str], str]
+
+    def rows(self, results: pd.DataFrame) -> pd.DataFrame:
+        """Rows that the table is made from, with the ends of their intervals.
+
+        Args:
+            results: Rows with the columns `COLUMNS`.
+
+        Raises:
+            ValueError: If ``results`` lacks a column.
+        """
+        require_columns(results, COLUMNS)
+        choice = results["choice"].astype(object).where(results["choice"].notna(), "")
+        rows = results.assign(choice=choice)
+        methods = pd.Series(list(zip(rows["method"], rows["choice"], strict=True)), rows.index)
+        wanted = {(g, name) for g, measure in self.columns for name in _with_ends(measure)}
+        cells = pd.Series(list(zip(rows["group"], rows["measure"], strict=True)), rows.index)
+        own = rows["suite"] == self.suite
+        return rows[own & methods.isin(list(self.methods)) & cells.isin(list(wanted))]
+
+    def markdown(self, results: pd.DataFrame) -> str:
+        """Lay the table out.
+
+        Args:
+            results: Rows with the columns `COLUMNS`.
+
+        Returns:
+            The table; a cell is a mean over people [95 % interval], or – without rows.
+
+        Raises:
+            ValueError: If ``results`` lacks a column.
+        """
+        key = ["method", "choice", "group", "measure"]
+        value = self.rows(results).groupby(key)["value"].mean().to_dict()
+        lines = []
+        for (method, choice), label in self.methods.items():
+            cells = []
+            for group, measure in self.columns:
+                found = [value.get((method, choice, group, n)) for n in _with_ends(measure)]
+                cells.append(_mean_and_ends(found))
+            lines.append([label, *cells])
+        return markdown_table(["method", *self.columns.values()], lines, right=len(self.columns))
+
+
+def _with_ends(measure: str) -> tuple[str, str, str]:
+    name, at, answers = measure.partition("@")
+    return measure, f"{name}_low{at}{answers}", f"{name}_high{at}{answers}"
+
+
+def _mean_and_ends(found: Sequence[float | None]) -> str:
+    mean, low, high = found
+    if mean is None or mean != mean:
+        return "–"
+    text = f"{mean + 0.0:.3f}"
+    if low is not None and high is not None and low == low:
+        text += f" [{low + 0.0:.3f}, {high + 0.0:.3f}]"
+    return text.replace("-", "−")
+
+
+def read_tables(path: Path) -> dict[str, ResultTable | PeopleTable]:
     """Read which tables there are.
 
     Args:
         path: A TOML file with a section for each table: ``suite``, ``measure``, ``methods`` (a list
-            of ``[method, choice, label]``) and ``scenarios`` (name = title).
+            of ``[method, choice, label]``) and ``scenarios`` (name = title); or, of real people,
+            ``columns`` (a list of ``[group, measure, title]``) in the place of ``measure`` and
+            ``scenarios``.
 
     Returns:
         The tables by name.
@@ -96,10 +177,14 @@ def read_tables(path: Path) -> dict[str, ResultTable]:
         FileNotFoundError: If there is no such file.
         ValueError: If it is no TOML, or a table is not described like that.
     """
-    tables = {}
+    tables: dict[str, ResultTable | PeopleTable] = {}
     for name, about in tomllib.loads(path.read_text(encoding="utf-8")).items():
         try:
             methods = {(method, choice): label for method, choice, label in about["methods"]}
+            if "columns" in about:
+                columns = {(group, measure): title for group, measure, title in about["columns"]}
+                tables[name] = PeopleTable(about["suite"], methods, columns)
+                continue
             tables[name] = ResultTable(
                 about["suite"], about["measure"], methods, about["scenarios"]
             )
@@ -111,7 +196,9 @@ def read_tables(path: Path) -> dict[str, ResultTable]:
     return tables
 
 
-def rows_for(tables: Mapping[str, ResultTable], results: pd.DataFrame) -> pd.DataFrame:
+def rows_for(
+    tables: Mapping[str, ResultTable | PeopleTable], results: pd.DataFrame
+) -> pd.DataFrame:
     """Keep of a benchmark's rows what its tables need, in their order.
 
     Args:
@@ -129,7 +216,7 @@ def rows_for(tables: Mapping[str, ResultTable], results: pd.DataFrame) -> pd.Dat
     return results.loc[sorted(set(needed)), COLUMNS]
 
 
-def make_tables(tables: Mapping[str, ResultTable], folder: Path) -> dict[str, str]:
+def make_tables(tables: Mapping[str, ResultTable | PeopleTable], folder: Path) -> dict[str, str]:
     """Lay out all tables from the rows in a folder.
 
     Args:

@@ -8,5 +8,5 @@
 * ``questions``: which pair to ask a person about next.
 * ``hypothesis_set``, ``policy_set``, ``encoded_policy_set``, ``reward_set``: the result of
   training, catering to one person, one for all; ``sets`` makes and reads a set of any kind.
-* ``schedules``: learning rates.
+* ``schedules``: learning rates; ``text_features``: what reward functions read of texts.
 """

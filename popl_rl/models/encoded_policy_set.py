@@ -1,4 +1,4 @@
-"""Policies for different z, with the encoder that tells which z a new rater wants (VPL)."""
+"""Hypotheses for different z, with the encoder that tells which z a new rater wants (VPL)."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,13 +11,15 @@ from torch import Tensor, nn
 
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
-from popl_rl.models.hypothesis_set import Catered
+from popl_rl.models.hypothesis_set import Catered, HypothesisSet
 from popl_rl.models.policies import PolicySpec, build_network
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.population import Population
+from popl_rl.models.reward_functions import RewardSpec
+from popl_rl.models.reward_set import RewardSet
 from popl_rl.storage import load_tensordict, save_tensordict
 
-__all__ = ["AnswerEncoder", "EncodedPolicySet"]
+__all__ = ["AnswerEncoder", "EncodedPolicySet", "EncodedRewardSet"]
 
 
 class AnswerEncoder(nn.Module):
@@ -34,7 +36,12 @@ class AnswerEncoder(nn.Module):
     """
 
     def __init__(
-        self, spec: PolicySpec, latent: int, *, units: int = 64, generator: torch.Generator
+        self,
+        spec: PolicySpec | RewardSpec,
+        latent: int,
+        *,
+        units: int = 64,
+        generator: torch.Generator,
     ) -> None:
         super().__init__()
         self.spec = spec
@@ -56,8 +63,11 @@ class AnswerEncoder(nn.Module):
         if self.spec.discrete:
             action = F.one_hot(action, self.spec.action_dim).float()
         steps = torch.cat([bank.observation[bank.row[segment]], action], -1)
-        embedded: Tensor = self.step(steps).relu().mean(-2)
-        return embedded
+        embedded: Tensor = self.step(steps).relu()
+        if bank.mask is None:
+            return embedded.mean(-2)
+        there = bank.mask[segment].unsqueeze(-1)
+        return (embedded * there).sum(-2) / there.sum(-2)
 
     def forward(self, bank: SegmentBank, preferred: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
         """The belief about raters.
@@ -75,18 +85,8 @@ class AnswerEncoder(nn.Module):
         return mean, log_std.clamp(-5, 2)
 
 
-class EncodedPolicySet(PolicySet):
-    """Policies for different z, of which a new rater is given the one that an encoder believes in.
-
-    Args:
-        population: N policies.
-        encoder: Tells what a rater wants.
-        z: For which z the policies are, ``[N, L]``.
-        alpha: Scale of their scores, as trained.
-        discount: Per-step discount of their scores.
-    """
-
-    _kind = "encoded_policy"
+class _Encoded(HypothesisSet):
+    """What sets of policies and of reward functions for different z share."""
 
     def __init__(
         self,
@@ -111,14 +111,14 @@ class EncodedPolicySet(PolicySet):
         mistake: float = 0.05,
         generator: torch.Generator | None = None,
     ) -> Catered:
-        """Choose a policy for one rater from a few answers.
+        """Choose a hypothesis for one rater from a few answers.
 
         Args:
             segments: What the answers are about.
             answers: TensorDict ``[K]`` with ``pair`` and ``answer``; ties and skips are ignored.
             method: ``"posterior"``: belief ``w_n ~ q(z_n | answers)`` of the encoder, and the one
                 believed in most, the nearest in units of the encoder's standard deviations.
-                ``"lexicase"``: as ``PolicySet.cater``.
+                ``"lexicase"``: as ``HypothesisSet.cater``.
             mistake: Not used.
             generator: Source of the lexicase draw.
 
@@ -161,9 +161,37 @@ class EncodedPolicySet(PolicySet):
         kept = load_tensordict(path / "encoder", required={"z": 2, "encoder": 0})
         z = kept["z"]
         if len(z) != len(population):
-            raise ValueError(f"there are {len(z)} z for {len(population)} policies")
-        spec = cast("PolicySpec", population.spec)
+            raise ValueError(f"there are {len(z)} z for {len(population)} members")
+        spec = cast("PolicySpec | RewardSpec", population.spec)
         generator = torch.Generator().manual_seed(0)
         encoder = AnswerEncoder(spec, z.shape[1], generator=generator).requires_grad_(False)
         encoder.load_state_dict(dict(kept["encoder"].items()))
         return cls(population, encoder=encoder, z=z, alpha=alpha, discount=discount)
+
+
+class EncodedPolicySet(_Encoded, PolicySet):
+    """Policies for different z, of which a new rater is given the one that an encoder believes in.
+
+    Args:
+        population: N policies.
+        encoder: Tells what a rater wants.
+        z: For which z the policies are, ``[N, L]``.
+        alpha: Scale of their scores, as trained.
+        discount: Per-step discount of their scores.
+    """
+
+    _kind = "encoded_policy"
+
+
+class EncodedRewardSet(_Encoded, RewardSet):
+    """Reward functions for different z, likewise.
+
+    Args:
+        population: N reward functions.
+        encoder: Tells what a rater wants.
+        z: For which z the reward functions are, ``[N, L]``.
+        alpha: Scale of their scores, as trained.
+        discount: Per-step discount of their scores.
+    """
+
+    _kind = "encoded_reward"

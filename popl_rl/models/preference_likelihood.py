@@ -37,9 +37,9 @@ def log_likelihood(margin: Tensor, mistake: float = MISTAKE) -> Tensor:
 
 
 def per_case(value: Tensor, comparisons: Comparisons) -> Tensor:
-    """Sums over the comparisons of each case, ``[..., M] -> [..., C]``."""
+    """Sums over the comparisons of each case, by their weights, ``[..., M] -> [..., C]``."""
     total = value.new_zeros(*value.shape[:-1], comparisons.num_cases)
-    return total.index_add_(-1, comparisons.case, value)
+    return total.index_add_(-1, comparisons.case, comparisons.weighted(value))
 
 
 def leave_one_out(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
@@ -52,5 +52,6 @@ def leave_one_out(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
     Returns:
         Log-likelihood of each comparison under that member, ``[M]``.
     """
-    others = per_case(likelihood, comparisons)[:, comparisons.case] - likelihood
+    own = comparisons.per_answer(likelihood)
+    others = per_case(likelihood, comparisons)[:, comparisons.case] - own
     return likelihood.gather(0, others.argmax(0, keepdim=True))[0]

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from popl_rl.data.bank import SegmentBank
-from popl_rl.keys import ACTION, OBSERVATION
+from popl_rl.keys import ACTION, MASK, OBSERVATION
 from popl_rl.models.policies import PolicySpec
 
 __all__ = ["RewardSpec", "reward_bank"]
@@ -21,7 +21,7 @@ class RewardSpec:
     """Everything needed to rebuild a reward network.
 
     A reward network has one output for each discrete action, the reward of taking it. There is no
-    bias in the last layer: segments have equal lengths, so that a constant reward cancels in every
+    bias in the last layer: among segments of equal lengths a constant reward cancels in every
     comparison.
 
     Attributes:
@@ -107,7 +107,7 @@ def reward_bank(segments: TensorDictBase) -> SegmentBank:
     action = segments[ACTION]
     if not action.is_floating_point():
         return SegmentBank.from_segments(segments)
-    joined = segments.select(OBSERVATION).copy()
+    joined = segments.select(OBSERVATION, MASK, strict=False).copy()
     joined[OBSERVATION] = torch.cat([segments[OBSERVATION], action], -1)
     joined[ACTION] = torch.zeros(action.shape[:2], dtype=torch.long, device=action.device)
     return SegmentBank.from_segments(joined)

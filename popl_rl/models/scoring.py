@@ -22,6 +22,11 @@ _ROWS = 1024  # observations looked at together
 _BLOCK = 2**18  # outputs of a layer, over these observations and some members
 
 
+def _weighted(value: Tensor, weight: Tensor) -> Tensor:
+    """Sums over steps ``[..., P, T] -> [..., P]``, with one weight for all segments or one each."""
+    return value @ weight if weight.ndim == 1 else (value * weight).sum(-1)
+
+
 def _chunks(total: int, size: int) -> Iterator[slice]:
     for start in range(0, total, size):
         yield slice(start, min(start + size, total))
@@ -90,7 +95,6 @@ class _Scoring:
         self.numbers = numbers
         self.steps = bank.row.shape[1]
         self.discount = discount
-        self.weight = discount ** torch.arange(self.steps, device=population.device).float()
         # Two or three results of a layer are alive at once, and as many of the trunk's.
         block = numbers // 32
         if population.device.type == "cpu":
@@ -124,7 +128,7 @@ class _Scoring:
             cells = table.flatten(1).T.contiguous()
             for part in _chunks(len(bank), max(1, self.numbers // (8 * (4 * steps + count)))):
                 cell = bank.row[part] * choices + bank.action[part]
-                weight = self.weight.expand(cell.shape).contiguous()
+                weight = self._weights(part).expand(cell.shape).contiguous()
                 scores[some, part] = F.embedding_bag(
                     cell, cells, mode="sum", per_sample_weights=weight
                 ).T
@@ -144,7 +148,7 @@ class _Scoring:
             scores[:, part] = heads @ some.to(self.dtype).T
 
     def _all_sums(self, width: int) -> Tensor:
-        sums = torch.empty(len(self.bank), width, device=self.weight.device)
+        sums = torch.empty(len(self.bank), width, device=self.bank.row.device)
         for part in _chunks(len(sums), max(1, self.rows // self.steps)):
             sums[part] = self._sums(part)
         return sums
@@ -153,7 +157,7 @@ class _Scoring:
         """Discounted sums of features, apart for each choice, ``[P, K * F]``."""
         row, action = self.bank.row[part], self.bank.action[part]
         features: Tensor = self.trunk(self.bank.observation[row])
-        chosen = F.one_hot(action, self.spec.action_dim) * self.weight.unsqueeze(1)
+        chosen = F.one_hot(action, self.spec.action_dim) * self._weights(part).unsqueeze(-1)
         return (chosen.mT @ features).flatten(1)
 
     def walk(self, scores: Tensor) -> None:
@@ -166,7 +170,11 @@ class _Scoring:
             for members in _chunks(len(scores), self.members):
                 output = apply_layers(some_layers(self.layers, members), seen)
                 value = spec.step_scores(output.float(), action).unflatten(1, (-1, self.steps))
-                scores[members, part] = value @ self.weight
+                scores[members, part] = _weighted(value, self._weights(part))
+
+    def _weights(self, part: slice) -> Tensor:
+        """What the steps of these segments count for, ``[T]`` or ``[P, T]``."""
+        return self.bank.weights(part, discount=self.discount)
 
     def _features(self) -> Tensor | None:
         """The trunk's outputs at all distinct observations, if they may be kept."""
@@ -225,11 +233,12 @@ def case_values(passes: Tensor, comparisons: Comparisons) -> Tensor:
         comparisons: The M comparisons and the case of each.
 
     Returns:
-        ``[N, C]`` float32; 0 or 1 where a case is a single preference.
+        ``[N, C]`` float32; 0 or 1 where a case is a single preference. Of soft labels and ties,
+        which are comparisons both ways with weights, it is the weighted share.
     """
     total = torch.zeros(len(passes), comparisons.num_cases, device=passes.device)
-    total.index_add_(1, comparisons.case, passes.float())
-    return total / comparisons.case.bincount(minlength=comparisons.num_cases).clamp(min=1)
+    total.index_add_(1, comparisons.case, comparisons.weighted(passes.float()))
+    return total / comparisons.sizes().clamp(min=1e-6)
 
 
 def rater_accuracy(values: Tensor, quantile: float = 0.1) -> float:

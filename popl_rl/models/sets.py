@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from popl_rl.models.encoded_policy_set import EncodedPolicySet
+from popl_rl.models.encoded_policy_set import EncodedPolicySet, EncodedRewardSet
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet
@@ -25,6 +25,6 @@ def load_set(path: Path | str) -> HypothesisSet:
         FileNotFoundError: If there is none.
         ValueError: If it is truncated, damaged, or something else.
     """
-    kinds: tuple[type[HypothesisSet], ...] = (RewardSet, EncodedPolicySet)
+    kinds: tuple[type[HypothesisSet], ...] = (RewardSet, EncodedRewardSet, EncodedPolicySet)
     kind = next((kind for kind in kinds if kind.is_at(path)), PolicySet)
     return kind.load(path)

@@ -7,5 +7,6 @@
   ``majority_plots``, which share ``state_lines``.
 - Of motion: ``motion_plots`` and ``animation``.
 - Of a benchmark: ``benchmark_plots`` and ``benchmark_curves``, which share ``benchmark_style``.
+- Of real people: ``people_plots``, and ``delivery_plots`` of where they drive.
 - ``style`` has the colours and headlines of all.
 """

@@ -47,7 +47,8 @@ def fingerprints(scores: Tensor) -> Tensor:
     for part in torch.split(scores, _rows_at_once(scores)):
         if part.dtype.is_floating_point:
             part = part + 0.0  # -0.0 equals 0.0 but has other bits
-        words = part.contiguous().view(torch.uint8)
+        # Flattened first: the stride of a single row is arbitrary, and views of other types mind.
+        words = part.flatten().view(torch.uint8).view(len(part), -1)
         if num_bytes % 8:
             words = torch.nn.functional.pad(words, (0, -num_bytes % 8))
         words = words.view(torch.int64)

@@ -4,13 +4,14 @@ import math
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.vpl import VPL, divergence, spread_points
 from popl_rl.config import Training, VPLSettings
 from popl_rl.data.bank import SegmentBank
 from popl_rl.keys import ANSWER, PAIR, RATER
-from popl_rl.models.encoded_policy_set import AnswerEncoder, EncodedPolicySet
+from popl_rl.models.encoded_policy_set import AnswerEncoder, EncodedPolicySet, EncodedRewardSet
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.reward_functions import RewardSpec
@@ -225,9 +226,20 @@ def test_looking_at_the_population_changes_nothing(bank, comparisons):
 
 
 def test_what_it_cannot_do_is_said(bank, comparisons):
-    with pytest.raises(ValueError, match=r"method vpl learns policies, not reward"):
-        build(bank, comparisons, spec=RewardSpec(5, 2, (6,)))
+    with pytest.raises(ValueError, match=r"method vpl needs a hidden layer"):
+        build(bank, comparisons, spec=RewardSpec(5, 2, ()))
     with pytest.raises(ValueError, match="latent must be at least 1, got 0"):
         build(bank, comparisons, latent=0)
     with pytest.raises(ValueError, match=r"kl must be at least 0, got -1"):
         build(bank, comparisons, kl=-1)
+
+
+def test_reward_functions_are_learnt_and_kept_likewise(bank, comparisons, tmp_path):
+    method = build(bank, comparisons, spec=RewardSpec(5, 2, (6,)))
+    method.step()
+    found = method.result()
+    found.save(tmp_path / "rewards")
+    loaded = load_set(tmp_path / "rewards")
+    assert isinstance(loaded, EncodedRewardSet)
+    answers = TensorDict({"pair": torch.tensor([[0, 1]]), "answer": torch.tensor([0])}, [1])
+    assert loaded.cater(bank, answers).member == found.cater(bank, answers).member

@@ -95,3 +95,44 @@ def test_rater_cases_need_raters(five):
     message = "preferences must hold 'rater', .* without ids use cases='preference'"
     with pytest.raises(ValueError, match=message):
         Comparisons.from_preferences(five, cases="rater")
+
+
+def test_ties_and_soft_labels_count_both_ways():
+    """Rater 0 says 0.8 for the second, rater 1 a tie: cross-entropies of labels in [0, 1]."""
+    preferences = TensorDict(
+        {
+            "pair": torch.tensor([[0, 1], [2, 3], [4, 5], [6, 7]]),
+            "answer": torch.tensor([1, 2, 0, 3]),
+            "chance": torch.tensor([0.8, 0.5, 0.0, 0.5]),
+            "rater": torch.tensor([0, 1, 1, 1]),
+        },
+        [4],
+    )
+    found = Comparisons.from_preferences(preferences, cases="rater", ties="count")
+    assert found.preferred.tolist() == [1, 3, 4, 0, 2]
+    assert found.other.tolist() == [0, 2, 5, 1, 3]
+    assert found.weight.tolist() == pytest.approx([0.8, 0.5, 1, 0.2, 0.5])
+    assert found.case.tolist() == [0, 1, 1, 0, 1]
+    assert found.answer.tolist() == [0, 1, 2, 0, 1]
+    assert found.sizes().tolist() == pytest.approx([1, 2])
+    assert found.num_dropped == 1
+    value = torch.tensor([10.0, 10, 10, 20, 20])
+    assert found.per_answer(value).tolist() == pytest.approx([12, 15, 10, 12, 15])
+    dropped = Comparisons.from_preferences(preferences, cases="rater")
+    assert dropped.preferred.tolist() == [1, 4]
+    assert dropped.weight is None
+
+
+def test_whoever_is_unknown_is_a_case_alone():
+    preferences = TensorDict(
+        {
+            "pair": torch.tensor([[0, 1]] * 5),
+            "answer": torch.tensor([0, 1, 2, 0, 0]),
+            "rater": torch.tensor([-1, 3, -1, -1, 3]),
+        },
+        [5],
+    )
+    found = Comparisons.from_preferences(preferences, cases="rater")
+    assert found.case.tolist() == [1, 0, 2, 0]
+    with pytest.raises(ValueError, match="ties must be 'drop' or 'count', got 'half'"):
+        Comparisons.from_preferences(preferences, cases="rater", ties="half")

@@ -4,6 +4,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from popl_rl.selection.behaviours import label_behaviours
 from popl_rl.selection.lexicase import lexicase_report
 
 
@@ -23,3 +24,10 @@ def test_rows_are_one_behaviour_exactly_if_they_are_equal(members, cases, flips,
         scores[member, data.draw(st.integers(0, cases - 1))] ^= True
     report = lexicase_report(scores, 1, generator=generator(seed))
     assert report.distinct == len(scores.unique(dim=0))
+
+
+def test_a_single_row_that_is_cut_from_a_wider_one():
+    """Its stride is no multiple of a word."""
+    scores = torch.zeros(1, 300, dtype=torch.uint8)
+    labels, first = label_behaviours(scores)
+    assert labels.tolist() == first.tolist() == [0]

@@ -1,0 +1,1 @@
+"""Settings of studies on real people; ``popl-people study=<name> data.load=<their data>``."""

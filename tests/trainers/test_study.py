@@ -1,0 +1,114 @@
+"""Studies, each one command, on small data of the same formats."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from popl_rl.envs.delivery import DeliveryGrid
+from popl_rl.experiments.delivery_study import exact_returns, led_to
+from popl_rl.experiments.tables import COLUMNS
+from popl_rl.trainers import run_study
+
+SHORT = [
+    "method.members=4",
+    "method.generations=3",
+    "method.training.steps=60",
+    "method.training.batch_size=64",
+    "method.refinement.steps=30",
+    "people.methods=[popl]",
+    "people.folds=2",
+    "people.repeats=1",
+    "people.curve=[0,5]",
+]
+
+
+@pytest.mark.slow
+def test_a_study_of_the_delivery_grid(tmp_path, capsys):
+    """16 people, half of whom look at what is collected, half at whether the goal is neared."""
+    grid, rng = DeliveryGrid(), np.random.default_rng(0)
+    reward = grid.step_reward.reshape(16, 4)
+    away = np.array([abs(cell // 4) + abs(3 - cell % 4) for cell in range(16)])
+    start = rng.choice(np.flatnonzero(grid.open), (16 * 24, 2))
+    action = rng.integers(4, size=(16 * 24, 2, 1))
+    place = np.stack(np.divmod(start, 4), -1)
+    cell, _ = grid.walk(place.reshape(-1, 2), action.reshape(-1, 1))
+    cell = cell.reshape(-1, 2)
+    after = np.array(
+        [
+            [
+                [grid.walk(p[None], np.array([[a, 0]]))[0][0, 1]]
+                for p, a in zip(pair, acts[:, 0], strict=True)
+            ]
+            for pair, acts in zip(place, action, strict=True)
+        ]
+    )[..., 0]
+    collected, neared = reward[cell, action[..., 0]], away[cell] - away[after]
+    person = np.repeat(np.arange(16), 24)
+    value = np.where((person % 2 == 0)[:, None], collected, neared)
+    answer = np.where(value[:, 0] == value[:, 1], 2, value.argmax(1))
+    np.savez(
+        tmp_path / "delivery.npz",
+        board=grid.board,
+        start=place,
+        action=action,
+        answer=answer,
+        rater=person,
+        condition=person % 2,
+        conditions=["pr-told", "regret-told"],
+    )
+    arguments = ["delivery", str(tmp_path), "--out", str(tmp_path / "out"), *SHORT]
+    assert run_study.main([*arguments, "people.least=6"]) == 0
+    rows = pd.read_csv(tmp_path / "out" / "results.csv")
+    assert list(rows) == COLUMNS
+    assert set(rows["group"]) == {"all", "pr-told", "regret-told", "pr", "regret"}
+    acting = pd.read_csv(tmp_path / "out" / "acting.csv")
+    assert set(acting["method"]) == {"popl", "pooled_cpl"}
+    assert acting["planned"].le(1 + 1e-6).all()
+    fits = pd.read_csv(tmp_path / "out" / "response.csv").set_index(["group", "label"])
+    fitted = fits["log_likelihood"]
+    assert fitted["pr-told", "return"] > fitted["pr-told", "regret"]
+    assert (tmp_path / "out" / "walks.png").is_file()
+    assert "How many further answers" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_study_of_arguments(tmp_path):
+    rng = np.random.default_rng(1)
+    words = ["tea", "milk", "sun", "rain", "fish", "tree"]
+    texts = [" ".join(rng.choice(words, size)) for size in rng.integers(2, 30, 20)]
+    items = [f"arg{number}" for number in range(20)]
+    pd.DataFrame({"item": items, "topic": "all", "text": texts}).to_csv(
+        tmp_path / "arguments.csv.gz", index=False
+    )
+    rows = []
+    for person in range(12):
+        for _ in range(20):
+            one, two = rng.choice(20, 2, replace=False)
+            longer = len(texts[two]) > len(texts[one])
+            rows.append((person, items[one], items[two], int(longer == (person % 2 == 0))))
+    columns = ["rater", "first", "second", "answer"]
+    pd.DataFrame(rows, columns=columns).to_csv(
+        tmp_path / "arguments_comparisons.csv.gz", index=False
+    )
+    out = tmp_path / "out"
+    assert run_study.main(["arguments", str(tmp_path), "--out", str(out), *SHORT]) == 0
+    wants = pd.read_csv(out / "wants.csv")
+    assert wants["length"].max() > 0.5
+    assert wants["length"].min() < -0.5
+    assert "prefers:" in (out / "pairs.md").read_text()
+
+
+def test_returns_of_the_optimum_and_of_random_steps():
+    table = DeliveryGrid().transition_table()
+    planned = exact_returns(table, table.steps["reward"])[1]
+    assert planned == pytest.approx(1)
+
+
+def test_conditions_say_what_people_were_led_to():
+    names = ["pr-trained", "regret-question", "trained-control", ""]
+    assert [led_to(name) for name in names] == ["pr", "regret", "", ""]
+
+
+def test_missing_data_are_refused(tmp_path, capsys):
+    assert run_study.main(["delivery", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert "data.load must be" in capsys.readouterr().err
