@@ -214,6 +214,7 @@ def answer_as(page, utility):
     press(page, key)
 
 
+@pytest.mark.slow  # many minutes of answers
 def test_people_label_a_set_is_trained_and_each_finds_a_policy(
     labels, utilities, visit, config_of, tmp_path
 ):
