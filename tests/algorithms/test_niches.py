@@ -47,7 +47,7 @@ def run(method):
 
 def served(found, bank, comparisons, group):
     """How right the best member is on the raters of each group."""
-    values = case_values(found._margins(bank, comparisons) > 0, comparisons)
+    values = case_values(found.margins(bank, comparisons) > 0, comparisons)
     return [float(values[:, group == one].mean(1).max()) for one in group.unique()]
 
 

@@ -42,7 +42,7 @@ def start(*arguments, script="train_popl", cwd=None):
         (["--cfg", "job"], 0, "alpha"),
         (["method.training.alpha=-1"], 2, "method.training.alpha must be positive, got -1.0"),
         (["method.em.groups=3"], 2, "method.em.groups is not read by method 'popl'"),
-        (["method=nonsense"], 2, "method/nonsense"),
+        (["method=nonsense"], 2, "unknown method 'nonsense'"),
         (["method.nonsense=1"], 2, "nonsense"),
         (["raters.shares=[1.0]"], 2, "raters.shares must be one number per group (2), got [1.0]"),
     ],
