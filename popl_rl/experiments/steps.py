@@ -233,7 +233,16 @@ def evolve(
         trainer.train()
     found = method.result()
     save_anew(found, run_dir / found.folder)
+    _write_sizes(method, run_dir / "sizes.csv")
     return found
+
+
+def _write_sizes(method: Method, path: Path) -> None:
+    """How well sets of each size predict raters, by methods that count their members so."""
+    sizes = getattr(method, "sizes", None)
+    if sizes:
+        rows = [f"{size},{mean:.6f},{error:.6f}\n" for size, mean, error in sizes]
+        write_atomic(path, "".join(["members,log_likelihood,error_of_gain\n", *rows]))
 
 
 def train_references(config: Config, setting: Setting, run_dir: Path) -> References:

@@ -261,3 +261,12 @@ def test_an_environment_from_a_file(train, tmp_path):
     assert len(groups) == 2
     assert math.isnan(result.board.value("popl", groups[0], "success"))
     assert math.isfinite(result.board.value("popl", groups[0], "return"))
+
+
+@pytest.mark.filterwarnings("default:all .* members are needed")  # a tiny run has few
+def test_niches_tell_how_well_each_size_predicts(train):
+    run_dir = train("method=popl_niches", "method.niches.specialists=20").run_dir
+    sizes = pd.read_csv(run_dir / "sizes.csv")
+    assert sizes.members.tolist() == list(range(1, len(sizes) + 1))
+    assert sizes.log_likelihood.lt(0).all()
+    assert sizes.error_of_gain[0] == 0
