@@ -4,6 +4,7 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,6 +17,7 @@ from torchrl.data import TensorDictReplayBuffer
 from popl_rl.config import DataConfig, EnvConfig, RatersConfig
 from popl_rl.data.environments import World, make_world
 from popl_rl.data.readers.imported import Imported
+from popl_rl.data.readers.opening import open_data
 from popl_rl.data.segments import collect_segments, segment_buffer, stored_segments
 from popl_rl.data.store import store_path, stored
 from popl_rl.keys import ACTION, GROUP, INFO, OBSERVATION
@@ -36,6 +38,7 @@ __all__ = [
     "describe",
     "first_segments",
     "fresh_segments",
+    "given_data",
     "make_data",
 ]
 
@@ -62,6 +65,19 @@ def build_world(config: EnvConfig) -> World:
         data_options=config.data_options,
         mixture=config.mixture,
     )
+
+
+def given_data(config: DataConfig) -> tuple[Path | None, Reader | None]:
+    """Where ``data.load`` is, and what reads it; None where nothing is to be loaded, or by nobody.
+
+    A folder of ours needs no reader.
+    """
+    if config.load is None:
+        return None, None
+    path = Path(config.load)
+    if config.reader is None and not path.is_file():
+        return path, None
+    return path, partial(open_data, reader=config.reader, options=config.reader_options)
 
 
 def build_groups(config: RatersConfig, world: World) -> tuple[RaterGroup, ...]:

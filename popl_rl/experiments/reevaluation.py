@@ -8,7 +8,7 @@ from popl_rl.config import Config
 from popl_rl.evaluation.diagnostics import diagnostics
 from popl_rl.evaluation.results import Scoreboard
 from popl_rl.experiments.builders import build_spec
-from popl_rl.experiments.data import build_groups, build_world, make_data
+from popl_rl.experiments.data import build_groups, build_world, given_data, make_data
 from popl_rl.experiments.evaluators import make_evaluator
 from popl_rl.experiments.report import markdown
 from popl_rl.experiments.run_folder import save_config
@@ -44,7 +44,7 @@ def evaluate_again(config: Config, run_dir: Path, *, seed: int) -> tuple[Path, S
         baselines = load_set(base_path)
     world = build_world(config.env)
     groups = build_groups(config.raters, world)
-    given = None if config.data.load is None else Path(config.data.load)
+    load, reader = (kept, None) if kept.is_dir() else given_data(config.data)
     data = make_data(
         config.data,
         config.raters,
@@ -52,7 +52,8 @@ def evaluate_again(config: Config, run_dir: Path, *, seed: int) -> tuple[Path, S
         groups,
         seed=config.seed,
         env=config.env,
-        load=kept if kept.is_dir() else given,
+        load=load,
+        reader=reader,
     )
     spec = build_spec(config.method, world.env)
     clone = load_set(clone_path) if clone_path.is_dir() else None

@@ -5,7 +5,6 @@ import shutil
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,7 +17,6 @@ from popl_rl.algorithms.trainer import MethodTrainer
 from popl_rl.config import Config, load_config, plain, validate
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.data.environments import World, indexed, is_stateless
-from popl_rl.data.readers.opening import open_data
 from popl_rl.evaluation.diagnostics import diagnostics
 from popl_rl.evaluation.evaluator import Evaluator
 from popl_rl.evaluation.results import Scoreboard
@@ -29,7 +27,7 @@ from popl_rl.experiments.builders import (
     build_spec,
     train_baselines,
 )
-from popl_rl.experiments.data import Data, build_groups, build_world, make_data
+from popl_rl.experiments.data import Data, build_groups, build_world, given_data, make_data
 from popl_rl.experiments.evaluators import make_evaluator
 from popl_rl.experiments.loggers import Progress, RunLogger, make_logger
 from popl_rl.experiments.metrics import MetricsWriter
@@ -140,14 +138,8 @@ def gather(config: Config, run_dir: Path) -> Setting:
     world = build_world(config.env)
     groups = build_groups(config.raters, world)
     kept = run_dir / "data"
-    load = kept if (kept / "preferences").is_dir() else None
-    reader = None
-    if load is None and config.data.load is not None:
-        load = Path(config.data.load)
-        if config.data.reader is not None or load.is_file():
-            reader = partial(
-                open_data, reader=config.data.reader, options=config.data.reader_options
-            )
+    has_kept = (kept / "preferences").is_dir()
+    load, reader = (kept, None) if has_kept else given_data(config.data)
     with Progress("segments", total=config.data.segments) as progress:
         data = make_data(
             config.data,

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from popl_rl.trainers import evaluate_policies
 from popl_rl.trainers.train_popl import run
 
 READER = """
@@ -52,6 +53,14 @@ def test_a_run_trains_on_what_a_reader_reads(config_of, tiny, theirs, tmp_path, 
     again = [f"data.load={tmp_path}/run/data", "data.reader=null", f"run_dir={tmp_path}/again"]
     other = run(config_of(*tiny[1:], *theirs, *again))
     assert other.board.results.equals(result.board.results)
+
+
+def test_data_that_were_not_kept_are_read_again_to_evaluate(config_of, tiny, theirs, tmp_path):
+    folder = f"run_dir={tmp_path / 'run'}"
+    first = run(config_of(*tiny[1:], *theirs, "data.save=false", folder))
+    again = config_of(folder, "seed=0", name="evaluate")
+    _, board = evaluate_policies.run(again)
+    assert board.results.equals(first.board.results)
 
 
 def test_what_refers_to_segments_that_do_not_exist_is_refused(config_of, tiny, theirs, tmp_path):
