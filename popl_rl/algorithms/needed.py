@@ -22,8 +22,17 @@ class Nested(NamedTuple):
     order: list[int]
     value: Tensor
 
+    def gains(self) -> list[tuple[float, float]]:
+        """What each member after the first adds: mean and standard error, paired over raters."""
+        gain = self.value.diff(dim=0)
+        # A single rater has no spread to judge by.
+        error = gain.std(1, correction=0) / gain.shape[1] ** 0.5 if len(gain) else gain.mean(1)
+        return list(zip(gain.mean(1).tolist(), error.tolist(), strict=True))
 
-def nested_subsets(likelihood: Tensor, comparisons: Comparisons) -> Nested:
+
+def nested_subsets(
+    likelihood: Tensor, comparisons: Comparisons, *, most: int | None = None
+) -> Nested:
     """Add members one after the other, each time the one that helps prediction most.
 
     A set predicts each answer of a rater by the member that the rater's other answers speak for, as
@@ -33,9 +42,10 @@ def nested_subsets(likelihood: Tensor, comparisons: Comparisons) -> Nested:
         likelihood: Log-likelihood of every comparison under every member, ``[K, M]``; for an honest
             count of members that were not trained on the rater whose comparison it is.
         comparisons: The M comparisons and the case of each.
+        most: Size of the largest subset; all K members if None.
 
     Returns:
-        The subsets, up to all K members.
+        The subsets, from the one of a single member on.
     """
     own = comparisons.per_answer(likelihood)
     others = per_case(likelihood, comparisons)[:, comparisons.case] - own
@@ -45,7 +55,7 @@ def nested_subsets(likelihood: Tensor, comparisons: Comparisons) -> Nested:
     strongest = torch.full_like(others[0], -torch.inf)
     predicted = torch.zeros_like(strongest)
     rest = list(range(len(likelihood)))
-    while rest:
+    for _ in range(len(rest) if most is None else min(most, len(rest))):
         changed = torch.where(others[rest] > strongest, likelihood[rest], predicted)
         value = per_case(changed, comparisons) / count
         best = int(value.mean(1).argmax())
@@ -66,8 +76,7 @@ def sufficient_size(nested: Nested, *, evidence: float) -> int:
         nested: The subsets.
         evidence: Standard errors; with 0 any improvement counts, with more there are fewer members.
     """
-    for size, gain in enumerate(nested.value.diff(dim=0), start=1):
-        error = gain.std(correction=0) / len(gain) ** 0.5
-        if gain.mean() <= evidence * error:
+    for size, (gain, error) in enumerate(nested.gains(), start=1):
+        if gain <= evidence * error:
             return size
-    return len(nested.value)
+    return len(nested.order)

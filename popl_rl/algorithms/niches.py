@@ -33,6 +33,7 @@ from popl_rl.config import NicheSettings, POPLSettings
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.population import Population
 from popl_rl.models.preference_likelihood import log_likelihood, per_case
+from popl_rl.models.schedules import decay
 from popl_rl.models.scoring import case_values, rater_accuracy
 from popl_rl.selection.lexicase import lexicase_given_first
 
@@ -106,9 +107,8 @@ class NichePOPL:
         # A member that serves nobody still needs something: everything, a bit.
         weight = (served[:, comparisons.case] + 1e-9).repeat(self.copies, 1)
         weight = weight * self._trained_on().repeat_interleave(len(self.share), 0)
-        # Held for half of the generations, then falling to zero.
-        rate = min(1.0, 2 * (1 - now / self.generations))
-        self.training.optimizer.param_groups[0]["lr"] = problem.training.learning_rate * rate
+        rate = problem.training.learning_rate * decay(now, self.generations)
+        self.training.optimizer.param_groups[0]["lr"] = rate
         loss = descend(
             problem.loss(self.stack),
             self.training.optimizer,
@@ -181,9 +181,8 @@ class NichePOPL:
         stack = self.stack.subset(range(needed))
         self.training = self.training.moved_to(stack, range(needed))
         self.stack, self.copies = stack, 1
-        gain = nested.value.diff(dim=0, prepend=nested.value[:1])
-        error = gain.std(1, correction=0) / gain.shape[1] ** 0.5
-        rows = zip(nested.value.mean(1).tolist(), error.tolist(), strict=True)
+        errors = [0.0, *(error for _, error in nested.gains())]
+        rows = zip(nested.value.mean(1).tolist(), errors, strict=True)
         self.sizes = [(size, *row) for size, row in enumerate(rows, start=1)]
 
     def _likelihood(self) -> Tensor:

@@ -14,38 +14,23 @@ from torch import Tensor
 
 from popl_rl.algorithms.expectation import expect
 from popl_rl.algorithms.losses import CPLLoss
+from popl_rl.algorithms.needed import nested_subsets
 from popl_rl.algorithms.problem import Problem
 from popl_rl.config import RefinementSettings
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.population import Population
-from popl_rl.models.preference_likelihood import leave_one_out, per_case
+from popl_rl.models.preference_likelihood import per_case
 
-__all__ = ["predictive", "refine", "smallest_subset"]
+__all__ = ["refine", "smallest_subset"]
 
 _CUTS = (0.2, 0.4)  # of the steps, after which members that nobody needs are dropped
 _LOOKS = 30  # E-steps, one before each block of gradient steps
 
 
-def predictive(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
-    """How well a set that is catered by a case's other answers predicts each of them.
-
-    Args:
-        likelihood: Log-likelihood of every comparison under every member, ``[K, M]``.
-        comparisons: The M comparisons and the case of each.
-
-    Returns:
-        Mean log-likelihood of each case's answers, ``[C]``.
-    """
-    count = comparisons.sizes().clamp(min=1e-6)
-    mean: Tensor = per_case(leave_one_out(likelihood, comparisons), comparisons) / count
-    return mean
-
-
 def smallest_subset(likelihood: Tensor, comparisons: Comparisons, *, most: int = 8) -> list[int]:
     """As few members as predict the raters as well as more of them do.
 
-    Members are added one after the other, each time the one that helps `predictive` most.
-    Of these nested subsets the smallest within one standard error of the best is taken (Breiman et
+    Of the `nested_subsets` the smallest within one standard error of the best is taken (Breiman et
     al., 1984): a further member has to earn its place.
 
     Args:
@@ -56,20 +41,12 @@ def smallest_subset(likelihood: Tensor, comparisons: Comparisons, *, most: int =
     Returns:
         Members, the most useful one first.
     """
-    chosen: list[int] = []
-    values = []
-    for _ in range(min(most, len(likelihood))):
-        rest = [member for member in range(len(likelihood)) if member not in chosen]
-        each = torch.stack([predictive(likelihood[[*chosen, one]], comparisons) for one in rest])
-        best = int(each.mean(1).argmax())
-        chosen.append(rest[best])
-        values.append(each[best])
-    value = torch.stack(values)
+    order, value = nested_subsets(likelihood, comparisons, most=most)
     behind = value[value.mean(1).argmax()] - value
     # A single case has no spread to judge by.
     error = behind.std(1, correction=0) / behind.shape[1] ** 0.5
     good = behind.mean(1) <= error
-    return chosen[: int(good.float().argmax()) + 1]
+    return order[: int(good.float().argmax()) + 1]
 
 
 def refine(

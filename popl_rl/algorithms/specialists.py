@@ -22,13 +22,11 @@ class Specialists:
 
     Attributes:
         population: S members.
-        rater: Whom each is for, ``[S]``.
         values: Share of each rater's answers that a specialist ranks as the rater did, ``[S, C]``.
             Of its own rater a specialist says nothing: in its place is its mean over the others.
     """
 
     population: Population
-    rater: Tensor
     values: Tensor
 
 
@@ -112,4 +110,4 @@ def train_specialists(
     place = torch.arange(len(rater), device=rater.device)
     own = values[place, rater]
     others = (values.sum(1) - own) / max(1, values.shape[1] - 1)
-    return Specialists(found, rater, values.index_put((place, rater), others))
+    return Specialists(found, values.index_put((place, rater), others))

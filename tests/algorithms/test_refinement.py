@@ -3,8 +3,9 @@ import math
 import pytest
 import torch
 
+from popl_rl.algorithms.needed import nested_subsets
 from popl_rl.algorithms.problem import Problem
-from popl_rl.algorithms.refinement import predictive, refine, smallest_subset
+from popl_rl.algorithms.refinement import refine, smallest_subset
 from popl_rl.config import RefinementSettings, Training
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
@@ -45,7 +46,7 @@ def test_predictive_by_hand():
     without answer 1 member 0 is ahead (-1 against -5): -2. Rater 1 is always member 0's.
     """
     likelihood = torch.tensor([[-1.0, -2.0, -1.0, -2.0], [-5.0, -1.0, -3.0, -4.0]])
-    found = predictive(likelihood, of_cases([0, 0, 1, 1]))
+    found = nested_subsets(likelihood, of_cases([0, 0, 1, 1])).value[-1]
     torch.testing.assert_close(found, torch.tensor([-3.5, -1.5]))
 
 
