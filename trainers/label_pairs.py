@@ -132,8 +132,7 @@ def run(config: LabelConfig) -> None:
     from popl_rl.web.server import regularly, run
 
     place = labelling.address.url + ("" if labelling.key is None else f"?key={labelling.key}")
-    who = "anybody who can reach it" if labelling.address.is_public else "this machine alone"
-    print(f"compare clips at {place} ({who}); Ctrl-C ends it", flush=True)
+    print(f"compare clips at {place} ({labelling.address.reach}); Ctrl-C ends it", flush=True)
     with regularly(labelling.export, seconds=5):
         run(labelling.app, labelling.address)
     answers = len(labelling.store.given())

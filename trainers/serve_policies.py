@@ -219,8 +219,7 @@ def run(config: ServeConfig) -> None:
     from popl_rl.web.server import run
 
     url, key = serving.address.url, serving.key
-    who = "anybody who can reach it" if serving.address.is_public else "this machine alone"
-    print(f"find a policy at {url}{'' if key is None else f'?key={key}'} ({who})")
+    print(f"find a policy at {url}{'' if key is None else f'?key={key}'} ({serving.address.reach})")
     more = "" if key is None else f"&key={key}"
     print(f"researchers: {url}researcher?pass={serving.word}{more}; Ctrl-C ends it", flush=True)
     run(serving.app, serving.address)

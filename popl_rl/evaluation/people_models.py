@@ -1,5 +1,6 @@
 """Predictors with a hypothesis of its own for each person: fine-tuned, or told by an encoder."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 
 import torch
@@ -18,7 +19,7 @@ __all__ = ["EncodedPredictor", "IndividualPredictor"]
 _CHUNK = 128  # people whose hypotheses are in memory at once
 
 
-class _OwnHypothesis:
+class _OwnHypothesis(ABC):
     """Judges each trial by a hypothesis of its own.
 
     Args:
@@ -30,8 +31,9 @@ class _OwnHypothesis:
     def __init__(self, problem: Problem, comparisons: Comparisons, *, scale: float = 1.0) -> None:
         self.problem, self.comparisons, self.scale = problem, comparisons, scale
 
+    @abstractmethod
     def _population(self, questions: Questions, trials: slice, answers: int) -> Population:
-        raise NotImplementedError
+        """The hypothesis of each trial."""
 
     def margins(self, questions: Questions, answers: int) -> Tensor:
         """Margins of the answers judged, ``[R, J]``."""

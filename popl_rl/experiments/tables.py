@@ -55,17 +55,11 @@ class ResultTable:
         Raises:
             ValueError: If ``results`` lacks a column.
         """
-        require_columns(results, COLUMNS)
-        # Without a single choice, pandas reads the column as numbers.
-        choice = results["choice"].astype(object).where(results["choice"].notna(), "")
-        rows = results.assign(choice=choice)
-        pairs = pd.Series(list(zip(rows["method"], rows["choice"], strict=True)), rows.index)
+        rows = _rows_of(results, self.suite, self.methods)
         return rows[
-            (rows["suite"] == self.suite)
-            & (rows["measure"] == self.measure)
+            (rows["measure"] == self.measure)
             & (rows["group"] != "all")
             & rows["scenario"].isin(list(self.scenarios))
-            & pairs.isin(list(self.methods))
         ]
 
     def markdown(self, results: pd.DataFrame) -> str:
@@ -113,14 +107,9 @@ class PeopleTable:
         Raises:
             ValueError: If ``results`` lacks a column.
         """
-        require_columns(results, COLUMNS)
-        choice = results["choice"].astype(object).where(results["choice"].notna(), "")
-        rows = results.assign(choice=choice)
-        methods = pd.Series(list(zip(rows["method"], rows["choice"], strict=True)), rows.index)
+        rows = _rows_of(results, self.suite, self.methods)
         wanted = {(g, name) for g, measure in self.columns for name in _with_ends(measure)}
-        cells = pd.Series(list(zip(rows["group"], rows["measure"], strict=True)), rows.index)
-        own = rows["suite"] == self.suite
-        return rows[own & methods.isin(list(self.methods)) & cells.isin(list(wanted))]
+        return rows[_pairs(rows, "group", "measure").isin(list(wanted))]
 
     def markdown(self, results: pd.DataFrame) -> str:
         """Lay the table out.
@@ -144,6 +133,23 @@ class PeopleTable:
                 cells.append(_mean_and_ends(found))
             lines.append([label, *cells])
         return markdown_table(["method", *self.columns.values()], lines, right=len(self.columns))
+
+
+def _rows_of(
+    results: pd.DataFrame, suite: str, methods: Mapping[tuple[str, str], str]
+) -> pd.DataFrame:
+    """Rows of a suite, and of methods by their names and choices."""
+    require_columns(results, COLUMNS)
+    # Without a single choice, pandas reads the column as numbers.
+    choice = results["choice"].astype(object).where(results["choice"].notna(), "")
+    rows = results.assign(choice=choice)
+    named = _pairs(rows, "method", "choice").isin(list(methods))
+    return rows[(rows["suite"] == suite) & named]
+
+
+def _pairs(rows: pd.DataFrame, one: str, other: str) -> pd.Series:
+    """What two columns hold, as a column of pairs."""
+    return pd.Series(list(zip(rows[one], rows[other], strict=True)), rows.index)
 
 
 def _with_ends(measure: str) -> tuple[str, str, str]:

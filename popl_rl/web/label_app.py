@@ -57,11 +57,7 @@ class LabelPages:
             Route("/done", self.done),
             Route("/back", self.back),
         ]
-        return Starlette(
-            routes=[*own, *self.pages.routes()],
-            middleware=list(middleware),
-            exception_handlers={HTTPException: self.pages.problem, 500: self.pages.problem},
-        )
+        return self.pages.application(own, middleware)
 
     def begin(self, request: Request) -> Response:
         """Instructions."""

@@ -3,14 +3,16 @@
 import html
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from typing import Any
 from urllib.parse import parse_qs
 
 import jinja2
 from markupsafe import Markup
+from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.routing import Route
@@ -61,6 +63,14 @@ class Pages:
             Route("/language/{code:str}", self._choose_language, methods=["POST"]),
             Route("/favicon.ico", self._nothing),
         ]
+
+    def application(self, routes: Sequence[Route], middleware: Sequence[Middleware]) -> Starlette:
+        """An application of some routes, with those of all pages beside them."""
+        return Starlette(
+            routes=[*routes, *self.routes()],
+            middleware=list(middleware),
+            exception_handlers={HTTPException: self.problem, 500: self.problem},
+        )
 
     def language_of(self, request: Request) -> str:
         """The language that a visitor chose, or the default."""

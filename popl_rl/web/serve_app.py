@@ -80,11 +80,7 @@ class ServePages:
             Route("/researcher.json", self.as_json),
         ]
         programs = api_routes(self.caterer, self.numbers, self.shows, self.pages.clips)
-        return Starlette(
-            routes=[*own, *programs, *self.pages.routes()],
-            middleware=list(middleware),
-            exception_handlers={HTTPException: self.pages.problem, 500: self.pages.problem},
-        )
+        return self.pages.application([*own, *programs], middleware)
 
     async def begin(self, request: Request) -> Response:
         """What is going to happen."""

@@ -27,6 +27,11 @@ class Address:
     url: str
     is_public: bool
 
+    @property
+    def reach(self) -> str:
+        """Who can open it, in words."""
+        return "anybody who can reach it" if self.is_public else "this machine alone"
+
 
 def listen(host: str, port: int) -> Address:
     """Bind to an address.
