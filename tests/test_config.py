@@ -140,6 +140,32 @@ CASES = [
     ("evaluation__curve", [5, 0], "evaluation.curve must be numbers of at least 1, got [5, 0]"),
     ("evaluation__history", -1, "evaluation.history must be at least 0, got -1"),
     ("logger__name", "paper", "logger.name must be wandb or csv, got 'paper'"),
+    ("raters__shares", [1.0, 0.0],
+     "raters.shares must be positive: leave out of raters.groups whom nobody belongs to, got "
+     "[1.0, 0.0]"),
+    ("raters__count", 1,
+     "raters.count must be at least one for each group (2), because a group that gives no strict "
+     "answer has no oracle: ask more raters, or set evaluation.baselines=false, got 1"),
+    ("raters__response__tie", math.inf,
+     "raters.response.tie must be at most 1.79769e+308, got inf"),
+    ("raters__response__skip", math.nan,
+     "raters.response.skip must be a finite number, or null, got nan"),
+    ("method__training__alpha", 1e30, "method.training.alpha must be at most 1000, got 1e+30"),
+    ("method__training__learning_rate", math.inf,
+     "method.training.learning_rate must be at most 10, got inf"),
+    ("method__popl__epsilon", "inf",
+     "method.popl.epsilon must be mad, a number of at least 0, or null, got 'inf'"),
+    ("method__generations", 10**12, "method.generations must be at most 1e+08, got 1000000000000"),
+    ("method__hidden", [10**9],
+     "method.hidden must be at most 100 layers of at most 1e+05 units, got [1000000000]"),
+    ("evaluation__curve", [10**9],
+     "evaluation.curve must be numbers of at most 1000000, got [1000000000]"),
+    ("evaluation__baselines_from", "/",
+     "evaluation.baselines_from must be the folder 'baselines' of an earlier run, got '/'"),
+    ("device", "gpu", "device must be cpu, cuda, or one of them, as cuda:1, got 'gpu'"),
+    ("seed", 2**64, "seed must be in 0..1000000000000000000, got 18446744073709551616"),
+    ("data__seed", -1, "data.seed must be in 0..1000000000000000000, got -1"),
+    ("run_dir", "", "run_dir must be a folder, or null, got ''"),
 ]  # fmt: skip
 
 
@@ -150,7 +176,11 @@ def test_a_problem_is_named_with_what_was_expected_and_what_came(path, value, me
 
 def test_several_problems_are_reported_together():
     config = valid(
-        method__cases="group", method__training__alpha=-1.0, raters__count=0, logger__name="paper"
+        method__cases="group",
+        method__training__alpha=-1.0,
+        raters__count=0,
+        logger__name="paper",
+        evaluation__baselines=False,
     )
     assert problems_of(config) == [
         "raters.count must be at least 1, got 0",

@@ -14,19 +14,32 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from popl_rl.config import (
+    CHANGEABLE,
     Config,
     EvaluateConfig,
     LabelConfig,
     MethodConfig,
     ServeConfig,
+    changing_nothing,
+    fixed,
     plain,
     unread,
     validate,
 )
 from popl_rl.trainers.spelling import explained
+from popl_rl.trainers.typed import as_typed
 
-__all__ = ["USER_ERRORS", "prepare", "read_options", "register_schemas", "run_command"]
+__all__ = [
+    "USER_ERRORS",
+    "given_overrides",
+    "prepare",
+    "read_options",
+    "register_schemas",
+    "run_command",
+]
 
+#: Names of the configurations that are settings of a run.
+_RUNS = ("train", "people")
 #: Errors that mean the user can put it right; anything else is a defect and keeps its traceback.
 USER_ERRORS = (HydraException, OmegaConfBaseException, ValueError, TypeError, OSError)
 
@@ -56,6 +69,7 @@ def run_command(main: Callable[[], Any], schema: type = Config) -> None:
         return
     # Without this Hydra prints errors its own way and leaves with 1, whatever they are.
     os.environ["HYDRA_FULL_ERROR"] = "1"
+    sys.argv[1:] = as_typed(sys.argv[1:], schema)
     try:
         main()
     except KeyboardInterrupt:
@@ -76,12 +90,21 @@ def prepare(config: Any) -> Config:
 
     Raises:
         ValueError: Listing every problem, also settings given on the command line that the chosen
-            method does not read.
+            method does not read, that change nothing, or that a run which is resumed has already.
     """
     settings: Config = plain(config)
-    if settings.resume is None:
-        validate(settings)
-    problems = unread(_given(), settings.method, _readers())
+    given = given_overrides()
+    if settings.resume is not None:
+        refused = fixed(given)
+        if refused:
+            raise ValueError(
+                f"resume={settings.resume} goes on with the settings of that run, so that "
+                f"{', '.join(refused)} cannot be given; beside resume= there may be "
+                f"{', '.join(CHANGEABLE)}. Leave the others out, or start another run"
+            )
+        return settings
+    validate(settings)
+    problems = [*changing_nothing(given), *unread(given, settings.method, _readers())]
     if problems:
         raise ValueError("settings that nobody reads:\n  " + "\n  ".join(problems))
     return settings
@@ -105,11 +128,12 @@ def read_options(given: Sequence[str]) -> dict[str, Any]:
     return found
 
 
-def _given() -> list[str]:
-    """Overrides of the command line, if Hydra has read one."""
+def given_overrides() -> list[str]:
+    """Overrides of the command line, if Hydra has read one that is of a run."""
     from hydra.core.hydra_config import HydraConfig
 
-    if not HydraConfig.initialized():
+    # A benchmark starts runs too, and what was typed is not theirs.
+    if not HydraConfig.initialized() or HydraConfig.get().job.config_name not in _RUNS:
         return []
     return [str(override) for override in HydraConfig.get().overrides.task]
 

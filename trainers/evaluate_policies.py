@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import hydra
 from omegaconf import OmegaConf
 
-from popl_rl.config import Config, EvaluateConfig, load_config, validate
+from popl_rl.config import Checker, Config, EvaluateConfig, load_config, validate
 from popl_rl.trainers.command import register_schemas, run_command
 
 if TYPE_CHECKING:
@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 
 def run(config: EvaluateConfig) -> tuple[Path, "Scoreboard"]:
     """Evaluate again; returns the folder that was written and the scoreboard."""
+    problems: list[str] = []
+    Checker("", problems).seed(config)
+    if problems:
+        raise ValueError(problems[0])
     run_dir = Path(config.run_dir)
     stored = _settings(config, run_dir, has_data=(run_dir / "data").is_dir())
     seed = stored.seed + 1 if config.seed is None else config.seed

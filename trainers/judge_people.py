@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import hydra
 
 from popl_rl.config import Config
-from popl_rl.trainers.command import prepare, register_schemas, run_command
+from popl_rl.trainers.command import given_overrides, prepare, register_schemas, run_command
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -44,7 +44,7 @@ def run(config: Config) -> Result:
     # Imported late, so that a wrong setting is told at once.
     from popl_rl.experiments import people_steps, steps
 
-    config, run_dir = steps.open_run(config, command=sys.argv)
+    config, run_dir = steps.open_run(config, command=sys.argv, given=given_overrides())
     people = people_steps.read_people(config, run_dir)
     told = ["oracle"] if any(people.groups) and config.method.ties == "drop" else []
     methods = [*people_steps.REFERENCES, *told, *config.people.methods]

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import hydra
 
 from popl_rl.config import Config
-from popl_rl.trainers.command import prepare, register_schemas, run_command
+from popl_rl.trainers.command import given_overrides, prepare, register_schemas, run_command
 
 if TYPE_CHECKING:
     from popl_rl.evaluation.results import Scoreboard
@@ -46,7 +46,7 @@ def run(config: Config) -> Result:
     # Imported late, so that a wrong setting is told at once.
     from popl_rl.experiments import steps
 
-    config, run_dir = steps.open_run(config, command=sys.argv)
+    config, run_dir = steps.open_run(config, command=sys.argv, given=given_overrides())
     if not config.raters.groups:
         return _run_people(config, run_dir)
 

@@ -3,10 +3,10 @@
 ``data``: environment, raters and segments; ``method``: methods, a section for each part;
 ``evaluation``: how the result is evaluated; ``people``: likewise, by held-out real people; ``run``:
 a whole run; ``stored``: those of an earlier run; ``pages``: what people answer on; ``checks``: how
-they check themselves; ``unread``: settings that the chosen method does not read.
+they check themselves; ``overrides``: what somebody typed that changes nothing, or may not change.
 """
 
-from popl_rl.config.checks import Checker, parse_epsilon
+from popl_rl.config.checks import MOST, MOST_SEED, Checker, parse_epsilon
 from popl_rl.config.data import DataConfig, EnvConfig, RatersConfig, ResponseConfig
 from popl_rl.config.evaluation import EvaluationConfig
 from popl_rl.config.method import (
@@ -21,6 +21,14 @@ from popl_rl.config.method import (
     Training,
     VPLSettings,
 )
+from popl_rl.config.overrides import (
+    CHANGEABLE,
+    OPEN,
+    changed,
+    changing_nothing,
+    fixed,
+    unread,
+)
 from popl_rl.config.pages import (
     LabelConfig,
     LabelSettings,
@@ -31,9 +39,12 @@ from popl_rl.config.pages import (
 from popl_rl.config.people import PeopleConfig
 from popl_rl.config.run import Config, EvaluateConfig, LoggerConfig, plain, validate
 from popl_rl.config.stored import load_config
-from popl_rl.config.unread import unread
 
 __all__ = [
+    "CHANGEABLE",
+    "MOST",
+    "MOST_SEED",
+    "OPEN",
     "SECTIONS",
     "Checker",
     "CloneSettings",
@@ -59,6 +70,9 @@ __all__ = [
     "ServeSettings",
     "Training",
     "VPLSettings",
+    "changed",
+    "changing_nothing",
+    "fixed",
     "load_config",
     "parse_epsilon",
     "plain",

@@ -2,7 +2,12 @@
 
 from collections.abc import Sequence
 
-__all__ = ["Checker", "parse_epsilon"]
+__all__ = ["MOST", "MOST_SEED", "Checker", "parse_epsilon"]
+
+#: No count of anything is greater: beyond it is a slip of the finger, or no machine's memory.
+MOST = 10**8
+#: Greatest seed: whatever is added to it still fits into 64 bits.
+MOST_SEED = 10**18
 
 
 class Checker:
@@ -27,23 +32,42 @@ class Checker:
             full = f"{self.path}.{name}" if self.path else name
             self.problems.append(f"{full} must be {expected}, got {value!r}")
 
-    def at_least_one(self, section: object, *names: str) -> None:
-        """Report settings that are below 1."""
+    def at_least_one(self, section: object, *names: str, most: float = MOST) -> None:
+        """Report settings that are below 1, or above ``most``."""
         for name in names:
             value = getattr(section, name)
             self.expect(value >= 1, name, "at least 1", value)
+            self._at_most(name, value, most)
 
-    def not_negative(self, section: object, *names: str) -> None:
-        """Report settings that are negative or NaN."""
+    def not_negative(self, section: object, *names: str, most: float = MOST) -> None:
+        """Report settings that are negative, NaN, or above ``most``."""
         for name in names:
             value = getattr(section, name)
             self.expect(value >= 0, name, "at least 0", value)
+            self._at_most(name, value, most)
 
-    def positive(self, section: object, *names: str) -> None:
-        """Report settings that are not positive."""
+    def positive(self, section: object, *names: str, most: float = MOST) -> None:
+        """Report settings that are not positive, or above ``most``."""
         for name in names:
             value = getattr(section, name)
             self.expect(value > 0, name, "positive", value)
+            self._at_most(name, value, most)
+
+    def seed(self, section: object, name: str = "seed") -> None:
+        """Report a seed that is negative, or that random generators cannot take; None is none."""
+        value = getattr(section, name)
+        fits = value is None or 0 <= value <= MOST_SEED
+        self.expect(fits, name, f"in 0..{MOST_SEED}", value)
+
+    def each(self, section: object, name: str, least: int, most: int = MOST) -> None:
+        """Report a list with numbers outside ``least..most``."""
+        values = list(getattr(section, name))
+        self.expect(all(v >= least for v in values), name, f"numbers of at least {least}", values)
+        self.expect(all(v <= most for v in values), name, f"numbers of at most {most}", values)
+
+    def _at_most(self, name: str, value: float, most: float) -> None:
+        # NaN is reported as being below already.
+        self.expect(not value > most, name, f"at most {most:g}", value)
 
     def share(self, section: object, *names: str) -> None:
         """Report settings outside (0, 1]."""
@@ -69,7 +93,7 @@ def parse_epsilon(epsilon: str | float | None) -> float | str | None:
         value = float(epsilon)
     except ValueError:
         value = -1.0
-    if not value >= 0:
+    if not 0 <= value < float("inf"):
         raise ValueError(
             f"method.popl.epsilon must be mad, a number of at least 0, or null, got {epsilon!r}"
         )

@@ -1,10 +1,12 @@
 """Settings of where data come from: the environment, the raters, the segments."""
 
 from dataclasses import dataclass, field
+from math import inf, isfinite
 from pathlib import Path
+from sys import float_info
 from typing import Any
 
-from popl_rl.config.checks import Checker
+from popl_rl.config.checks import MOST, Checker
 
 __all__ = ["DataConfig", "EnvConfig", "RatersConfig", "ResponseConfig"]
 
@@ -31,6 +33,8 @@ class EnvConfig:
         if self.factory == "gymnasium:make":
             name = "the id of a Gymnasium environment, such as env.id=CartPole-v1"
             at.expect(bool(self.id), "id", name, self.id)
+        if self.id is not None:
+            at.expect(bool(self.id), "id", "an id, or null", self.id)
         if self.mixture is not None:
             proper = all(share >= 0 for share in self.mixture.values())
             proper = proper and abs(sum(self.mixture.values()) - 1) < 1e-6
@@ -50,10 +54,12 @@ class ResponseConfig:
 
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
-        at.positive(self, "rationality")
+        at.positive(self, "rationality", most=inf)
         at.expect(0 <= self.mistake <= 1, "mistake", "in [0, 1]", self.mistake)
         at.share(self, "myopia")
-        at.not_negative(self, "tie")
+        at.not_negative(self, "tie", most=float_info.max)
+        if self.skip is not None:
+            at.expect(isfinite(self.skip), "skip", "a finite number, or null", self.skip)
 
 
 @dataclass
@@ -78,6 +84,9 @@ class RatersConfig:
             at.expect(len(self.shares) == len(self.groups), "shares", expected, self.shares)
             proper = all(share >= 0 for share in self.shares) and abs(sum(self.shares) - 1) < 1e-6
             at.expect(proper, "shares", "non-negative and sum to 1", self.shares)
+            somebody = not proper or all(share > 0 for share in self.shares)
+            cure = "positive: leave out of raters.groups whom nobody belongs to"
+            at.expect(somebody, "shares", cure, self.shares)
         at.expect(self.label in ("regret", "return"), "label", "regret or return", self.label)
         self.response.check(at.below("response"))
 
@@ -99,8 +108,10 @@ class DataConfig:
 
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
-        at.at_least_one(self, "length")
+        at.at_least_one(self, "length", most=10**6)
         at.expect(self.segments >= 2, "segments", "at least 2, to compare", self.segments)
+        at.expect(self.segments <= MOST, "segments", f"at most {MOST:g}", self.segments)
+        at.seed(self)
         if self.load is not None:
             folder = "the folder 'data' of an earlier run, or other data with data.reader"
             found = (Path(self.load) / "segments").is_dir() or Path(self.load).is_file()

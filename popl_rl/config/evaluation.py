@@ -37,14 +37,14 @@ class EvaluationConfig:
         """Report values that are out of range."""
         at.at_least_one(self, "episodes", "new_raters", "answers", "pairs", "curve_members")
         at.at_least_one(self, "ppo_frames", "brex_steps", "dpl_steps")
-        positive = all(answers >= 1 for answers in self.curve)
-        at.expect(positive, "curve", "numbers of at least 1", list(self.curve))
+        at.each(self, "curve", 1, most=10**6)
         at.expect(self.menu >= 2, "menu", "at least 2, to choose", self.menu)
+        at.expect(self.menu <= 10**6, "menu", "at most 1e+06", self.menu)
         at.one_of(self, "optimiser", ("auto", "plan", "ppo"))
         at.one_of(self, "reference", ("random", "clone", "others"))
         at.not_negative(self, "history")
         if self.baselines_from is not None:
             expected = "the folder 'baselines' of an earlier run"
-            at.expect(
-                Path(self.baselines_from).is_dir(), "baselines_from", expected, self.baselines_from
-            )
+            # Each kind of set says what it is in a file of such a name.
+            found = any(Path(self.baselines_from).glob("*_set.json"))
+            at.expect(found, "baselines_from", expected, self.baselines_from)

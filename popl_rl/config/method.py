@@ -33,7 +33,8 @@ class Training:
 
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
-        at.positive(self, "alpha", "learning_rate")
+        at.positive(self, "alpha", most=1000)
+        at.positive(self, "learning_rate", most=10)
         at.share(self, "conservatism", "discount")
         at.at_least_one(self, "batch_size", "steps")
         at.expect(0 <= self.slip < 0.5, "slip", "in [0, 0.5)", self.slip)
@@ -62,7 +63,7 @@ class POPLSettings:
         at.one_of(self, "variation", ("auto", "gradient", "gaussian", "mixtures"))
         at.one_of(self, "features", ("random", "pooled"))
         at.not_negative(self, "warm_up")
-        at.positive(self, "mutation_std")
+        at.positive(self, "mutation_std", most=1000)
         at.expect(bool(self.selection), "selection", "lexicase or a reference", self.selection)
         try:
             parse_epsilon(self.epsilon)
@@ -127,7 +128,7 @@ class MixtureSettings:
         names = ("mixtures", "generations", "steps", "block", "bundle", "first_selection")
         at.at_least_one(self, *names, "final_steps", "final_batch_size")
         at.expect(self.folds >= 2, "folds", "at least 2", self.folds)
-        at.positive(self, "alpha")
+        at.positive(self, "alpha", most=1000)
         at.share(self, "conservatism")
         at.expect(0 <= self.slip < 0.5, "slip", "in [0, 0.5)", self.slip)
         for name in ("held_out", "exchange", "removal"):
@@ -145,7 +146,8 @@ class CloneSettings:
 
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
-        at.at_least_one(self, "code_dim", "steps")
+        at.at_least_one(self, "code_dim", most=1000)
+        at.at_least_one(self, "steps")
         at.not_negative(self, "beta")
 
 
@@ -158,7 +160,7 @@ class EMSettings:
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
         if self.groups is not None:
-            at.at_least_one(self, "groups")
+            at.at_least_one(self, "groups", most=10**4)
 
 
 @dataclass
@@ -171,7 +173,8 @@ class VPLSettings:
 
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
-        at.at_least_one(self, "latent", "answers")
+        at.at_least_one(self, "latent", most=10**4)
+        at.at_least_one(self, "answers")
         at.not_negative(self, "kl")
 
 
@@ -236,8 +239,11 @@ class MethodConfig:
         at.expect(self.cases in ("rater", "preference"), "cases", "rater or preference", self.cases)
         at.one_of(self, "ties", ("drop", "count"))
         at.one_of(self, "evolve", ("all", "head", "code"))
-        at.at_least_one(self, "members", "generations")
+        at.at_least_one(self, "members", most=10**6)
+        at.at_least_one(self, "generations")
         at.expect(all(units >= 1 for units in self.hidden), "hidden", "positive", self.hidden)
+        small = len(self.hidden) <= 100 and all(units <= 10**5 for units in self.hidden)
+        at.expect(small, "hidden", "at most 100 layers of at most 1e+05 units", self.hidden)
         for name in SECTIONS:
             getattr(self, name).check(at.below(name))
         self._check_together(at)

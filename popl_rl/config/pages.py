@@ -67,6 +67,7 @@ class LabelConfig(Config):
 
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
+        at.seed(self)
         for name in ("env", "data", "label", "page"):
             getattr(self, name).check(at.below(name))
 
@@ -85,7 +86,7 @@ class ServeSettings:
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
         at.at_least_one(self, "questions", "candidates", "episodes")
-        at.expect(self.enough > 0, "enough", "positive", self.enough)
+        at.positive(self, "enough")
         at.expect(self.segments >= 2, "segments", "at least 2, to compare", self.segments)
         at.not_negative(self, "further")
 
@@ -101,5 +102,6 @@ class ServeConfig:
 
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
+        at.seed(self)
         for name in ("serve", "page"):
             getattr(self, name).check(at.below(name))

@@ -1,6 +1,8 @@
 """Settings of a whole run, and one check of it all."""
 
-from dataclasses import dataclass, field, fields
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, Protocol
 
 from omegaconf import MISSING, DictConfig, OmegaConf
@@ -9,6 +11,7 @@ from popl_rl.config.checks import Checker
 from popl_rl.config.data import DataConfig, EnvConfig, RatersConfig
 from popl_rl.config.evaluation import EvaluationConfig
 from popl_rl.config.method import MethodConfig
+from popl_rl.config.overrides import OPEN
 from popl_rl.config.people import PeopleConfig
 
 __all__ = ["Checked", "Config", "EvaluateConfig", "LoggerConfig", "plain", "validate"]
@@ -75,12 +78,30 @@ class Config:
         from_people = bool(self.raters.groups) or self.data.load is not None
         cure = "one or more rater references, unless people's answers are in data.load"
         at.expect(from_people, "raters.groups", cure, self.raters.groups)
-        proper = self.device.split(":")[0] in ("cpu", "cuda")
-        at.expect(proper, "device", "cpu or cuda", self.device)
-        at.at_least_one(self, "threads", "checkpoint_interval")
-        if self.method.evolve != "code" and self.evaluation.reference != "clone":
-            return
-        at.expect(self.method.learns != "reward", "method.learns", "policy for a clone", "reward")
+        proper = re.fullmatch(r"cpu|cuda(:\d{1,3})?", self.device)
+        at.expect(proper is not None, "device", "cpu, cuda, or one of them, as cuda:1", self.device)
+        at.at_least_one(self, "threads", most=1024)
+        at.at_least_one(self, "checkpoint_interval")
+        at.seed(self)
+        for name in ("run_dir", "resume"):
+            value = getattr(self, name)
+            at.expect(value is None or bool(value.strip()), name, "a folder, or null", value)
+        self._check_together(at)
+
+    def _check_together(self, at: Checker) -> None:
+        """Report what is well by itself and does not go together."""
+        asked, groups = self.raters.count, len(self.raters.groups)
+        # Answers that are loaded have raters of their own.
+        is_trained = self.evaluation.baselines and self.evaluation.baselines_from is None
+        if is_trained and self.data.load is None:
+            expected = (
+                f"at least one for each group ({groups}), because a group that gives no strict "
+                "answer has no oracle: ask more raters, or set evaluation.baselines=false"
+            )
+            at.expect(asked >= groups, "raters.count", expected, asked)
+        if self.method.evolve == "code" or self.evaluation.reference == "clone":
+            learns = self.method.learns
+            at.expect(learns != "reward", "method.learns", "policy for a clone", learns)
 
 
 def plain(config: Any) -> Any:
@@ -88,8 +109,35 @@ def plain(config: Any) -> Any:
 
     Args:
         config: A ``DictConfig`` with a schema of this package, or such a dataclass.
+
+    Raises:
+        ValueError: If there are settings that the schema does not know.
     """
-    return OmegaConf.to_object(config) if isinstance(config, DictConfig) else config
+    if not isinstance(config, DictConfig):
+        return config
+    unknown = list(_unknown(config, ""))
+    if unknown:
+        raise ValueError(
+            f"there is no such setting as {', '.join(unknown)}; what is appended with a plus are "
+            f"arguments, in {', '.join(OPEN)}"
+        )
+    return OmegaConf.to_object(config)
+
+
+def _unknown(config: DictConfig, path: str) -> Iterator[str]:
+    """Names that Hydra has let somebody append to a section that has a schema."""
+    schema = OmegaConf.get_type(config)
+    if not is_dataclass(schema):
+        return
+    known = {field.name for field in fields(schema)}
+    for name in config:
+        full = f"{path}{name}"
+        if name not in known:
+            yield full
+        elif not OmegaConf.is_missing(config, name):
+            value = config[name]
+            if isinstance(value, DictConfig):
+                yield from _unknown(value, f"{full}.")
 
 
 def validate(config: Checked) -> None:

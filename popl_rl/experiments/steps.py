@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from popl_rl.algorithms.problem import Method, Problem
 from popl_rl.algorithms.reward_baselines import RewardBaselines, train_reward_baselines
 from popl_rl.algorithms.trainer import MethodTrainer
-from popl_rl.config import Config, load_config, plain, validate
+from popl_rl.config import Config, changed, load_config, plain, validate
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.data.environments import World, indexed, is_stateless
 from popl_rl.evaluation.diagnostics import diagnostics
@@ -95,12 +95,16 @@ class References:
     rewards: RewardBaselines | None
 
 
-def open_run(config: Config, *, command: Sequence[str]) -> tuple[Config, Path]:
+def open_run(
+    config: Config, *, command: Sequence[str], given: Sequence[str] = ()
+) -> tuple[Config, Path]:
     """Make the folder of a run, or find the one to continue with its own settings.
 
     Args:
         config: Settings that were checked; of a run that is continued, where it is.
         command: What was typed, for ``metadata.json``.
+        given: Overrides that were typed; of those beside ``resume=`` a run that is continued takes
+            the ones that ``popl_rl.config.CHANGEABLE`` allows.
 
     Raises:
         ValueError: If the settings of the run that is continued are off, or those of a new one name
@@ -109,7 +113,11 @@ def open_run(config: Config, *, command: Sequence[str]) -> tuple[Config, Path]:
     """
     if config.resume is not None:
         run_dir = create_run_dir(Path(config.resume), name="", resume=True)
-        config = plain(OmegaConf.merge(OmegaConf.structured(Config), load_config(run_dir)))
+        stored: Any = OmegaConf.merge(OmegaConf.structured(Config), load_config(run_dir))
+        asked = OmegaConf.structured(config)
+        for name in changed(given):
+            OmegaConf.update(stored, name, OmegaConf.select(asked, name))
+        config = plain(stored)
         validate(config)
     else:
         _check_references(config)

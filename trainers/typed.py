@@ -1,0 +1,58 @@
+"""Text that Hydra would read as a number or as true and false, kept as it was typed."""
+
+from collections.abc import Sequence
+from dataclasses import fields, is_dataclass
+from types import UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import OverrideParseException
+
+__all__ = ["as_typed"]
+
+
+def as_typed(arguments: Sequence[str], schema: type) -> list[str]:
+    """Quote the values of text settings that would come out as other text.
+
+    ``run_dir=2026_01`` would be the folder ``202601``, because underscores may divide the digits of
+    a number, and ``run_dir=1e3`` the folder ``1000.0``.
+
+    Args:
+        arguments: Of the command.
+        schema: Dataclass of its settings.
+
+    Returns:
+        The arguments for Hydra. Values that are lists, mappings or sweeps with functions are left
+        as they are; each value of a sweep ``a,b`` is looked at by itself.
+    """
+    texts = set(_texts(schema))
+    parser = OverridesParser.create()
+    kept = []
+    for argument in arguments:
+        key, equals, value = argument.partition("=")
+        if equals and key.lstrip("+") in texts:
+            argument = f"{key}={','.join(_quoted(part, parser) for part in value.split(','))}"
+        kept.append(argument)
+    return kept
+
+
+def _quoted(value: str, parser: OverridesParser) -> str:
+    try:
+        read = parser.parse_override(f"x={value}").value()
+    except OverrideParseException:
+        return value  # Hydra says what is wrong with it
+    changed = isinstance(read, (int, float)) and str(read) != value
+    return f"'{value}'" if changed else value
+
+
+def _texts(schema: type, path: str = "") -> list[str]:
+    """Names of all settings that are text, with dots."""
+    found = []
+    hints: dict[str, Any] = get_type_hints(schema)
+    for field in fields(schema):
+        kind, name = hints[field.name], f"{path}{field.name}"
+        if is_dataclass(kind) and isinstance(kind, type):
+            found += _texts(kind, f"{name}.")
+        elif kind is str or (get_origin(kind) in (Union, UnionType) and str in get_args(kind)):
+            found.append(name)
+    return found
