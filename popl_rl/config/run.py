@@ -131,7 +131,7 @@ def _unknown(config: DictConfig, path: str) -> Iterator[str]:
         return
     known = {field.name for field in fields(schema)}
     for name in config:
-        full = f"{path}{name}"
+        full = f"{path}{name!s}"
         if name not in known:
             yield full
         elif not OmegaConf.is_missing(config, name):
