@@ -164,7 +164,7 @@ def check_scripted(
             f"task {env.task!r}: the scripted policy succeeds too rarely to learn from within "
             f"{env.max_steps} steps ({said} of {episodes} episodes, at least {least:.0%} wanted); "
             "raise env.max_steps, leave out speeds at which it fails "
-            "(+env.options.speeds=[0.6,0.8]), or choose another task."
+            "(env.options.speeds=[0.6,0.8]), or choose another task."
         )
     return rates
 

@@ -53,7 +53,11 @@ HIDDEN_KEYS: tuple[NestedKey, ...] = (GROUP, UTILITY)
 
 
 class Answer(IntEnum):
-    """What a rater said about a pair; the first two are the position of the preferred segment."""
+    """What a rater said about a pair.
+
+    The first two are the position, in ``pair``, of the segment that is preferred; no number of a
+    segment, and no sign of who won.
+    """
 
     FIRST = 0
     SECOND = 1

@@ -15,6 +15,7 @@ import difflib
 import hashlib
 import importlib
 import importlib.util
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -45,6 +46,10 @@ _FORMS = (
     "(a relative path starts at the current directory)."
 )
 _registered: dict[str, dict[str, Any]] = {kind: {} for kind in get_args(Kind)}
+#: What files declare, by kind, module and name: ``file.py:name`` finds it, whoever has it else.
+_declared: dict[tuple[str, str, str], Any] = {}
+_FILE = "popl_rl_file_"  # before the names of modules that are loaded from files
+_folders: set[str] = set()  # of files that were loaded, from which these import what is beside them
 
 
 def env(name: str) -> Callable[[_T], _T]:
@@ -138,7 +143,8 @@ def names(kind: Kind) -> list[str]:
 def resolve(kind: Kind, reference: str) -> Any:
     """Return the object that a reference names.
 
-    A file is loaded once per process. Loading it also registers what it decorates.
+    A file is loaded once per process. Loading it also registers what it decorates, and lets it
+    import the files beside it. ``file.py:name`` is what the file calls so, or decorates so.
 
     Args:
         kind: What is expected, such as "env" or "rater".
@@ -199,7 +205,15 @@ def _decorator(kind: Kind, name: str) -> Callable[[_T], _T]:
         )
 
     def register(found: _T) -> _T:
+        module = getattr(found, "__module__", "")
+        is_from_file = module.startswith(_FILE)
+        if is_from_file:
+            _declared[kind, module, name] = found
         held = _holder(kind, name)
+        if held is not None and is_from_file and name in _entry_points(kind):
+            # A name of another world's, which somebody with a file need not know; file.py:name is
+            # theirs all the same.
+            return found
         # A reload, or the same file loaded a second way, defines the same thing again.
         if held is not None and held != _origin(found):
             raise ValueError(
@@ -296,9 +310,10 @@ def _load_file(kind: Kind, reference: str, source: str) -> ModuleType:
     # The digest keeps two files of one name apart; being in sys.modules lets pickle find what the
     # file defines.
     digest = hashlib.sha256(str(path).encode()).hexdigest()[:12]
-    name = f"popl_rl_file_{path.stem}_{digest}"
+    name = f"{_FILE}{path.stem}_{digest}"
     if name in sys.modules:
         return sys.modules[name]
+    _import_beside(kind, reference, path)
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None
@@ -314,15 +329,45 @@ def _load_file(kind: Kind, reference: str, source: str) -> ModuleType:
     return module
 
 
+def _import_beside(kind: Kind, reference: str, path: Path) -> None:
+    """Let a file import those beside it, as if it were run as a script.
+
+    Raises:
+        ValueError: If it would get a module of the same name from beside another such file.
+    """
+    folder = str(path.parent)
+    for other in path.parent.glob("*.py"):
+        loaded = getattr(sys.modules.get(other.stem), "__file__", None)
+        if loaded is None or str(Path(loaded).parent) not in _folders - {folder}:
+            continue
+        if re.search(rf"^\s*(import|from)\s+{re.escape(other.stem)}\b", path.read_text(), re.M):
+            raise ValueError(
+                f"{kind} {reference!r}: {path} imports {other.stem!r}, which in this process is "
+                f"{loaded} already, beside another file; rename one of the two"
+            )
+    _folders.add(folder)
+    if folder not in sys.path:
+        sys.path.append(folder)  # the last, so that nothing installed is hidden
+
+
 def _attribute(kind: Kind, reference: str, module: ModuleType, name: str) -> Any:
+    if (kind, module.__name__, name) in _declared:
+        return _declared[kind, module.__name__, name]
     if hasattr(module, name):
         return getattr(module, name)
     own = sorted(
-        key
-        for key, value in vars(module).items()
-        if not key.startswith("_")
-        and callable(value)
-        and getattr(value, "__module__", None) == module.__name__
+        {
+            key
+            for key, value in vars(module).items()
+            if not key.startswith("_")
+            and callable(value)
+            and getattr(value, "__module__", None) == module.__name__
+        }
+        | {
+            declared
+            for of, source, declared in _declared
+            if (of, source) == (kind, module.__name__)
+        }
     )
     nearest = difflib.get_close_matches(name, own, n=1)
     guess = f" Did you mean {nearest[0]!r}?" if nearest else ""

@@ -18,6 +18,7 @@ from popl_rl.raters.collector import collect_preferences
 from popl_rl.raters.groups import make_groups
 from popl_rl.raters.people import Raters
 from popl_rl.testing import likes_left, likes_right, tiny_env
+from popl_rl.trainers.typed import opened
 
 # Small tensors are slower on several threads, and tests share their cores.
 torch.set_num_threads(1)
@@ -64,7 +65,7 @@ def config_of():
 
     def make(*overrides, name="train"):
         with initialize_config_module("popl_rl.configs", version_base="1.3"):
-            return compose(name, overrides=list(overrides))
+            return compose(name, overrides=opened(overrides))
 
     return make
 

@@ -82,9 +82,9 @@ CASES = [
      "env.mixture must be non-negative shares that sum to 1, got {'a': 0.5, 'b': 0.4}"),
     ("env__mixture", {"a": 1.5, "b": -0.5},
      "env.mixture must be non-negative shares that sum to 1, got {'a': 1.5, 'b': -0.5}"),
-    ("env__mixture", {}, "env.mixture must be non-negative shares that sum to 1, got {}"),
     ("raters__groups", [],
-     "raters.groups must be one or more rater references, unless people's answers are in "
+     "raters.groups must be one or more rater references, such as [my_raters.py:fast,"
+     "my_raters.py:careful], unless people's answers are in "
      "data.load, got []"),
     ("raters__groups", ["upper", "upper"],
      "raters.groups must be different groups, got ['upper', 'upper']"),
@@ -301,6 +301,10 @@ def test_every_choice_fits_its_schema_and_is_valid(choice, config_of, tmp_path):
         with pytest.raises(ValueError, match=rf"env\.{name} must be"):
             validate(config)
         config.env[name] = value
+    if choice in (*must_be_given, "raters=own"):
+        with pytest.raises(ValueError, match=r"^[^\n]*\n  raters\.groups must be [^\n]*$"):
+            validate(config)
+        config.raters.groups = ["my_env.py:mine"]
     validate(config)
 
 

@@ -230,3 +230,32 @@ def test_what_is_registered_in_isolation_is_forgotten():
 
         assert resolve("rater", "passing") is passing
     assert names("rater") == before
+
+
+def test_a_file_may_use_a_name_of_another_world(tmp_path):
+    """``file.py:name`` is the file's, by the name it is decorated with or its own."""
+    path = tmp_path / "raters_of_mine.py"
+    path.write_text(
+        "from popl_rl import rater\n\n@rater('upper')\ndef mine(segments):\n    return segments\n"
+    )
+    by_name, by_function = resolve("rater", f"{path}:upper"), resolve("rater", f"{path}:mine")
+    assert by_name is by_function
+    assert resolve("rater", "upper").__module__ == "popl_rl.envs.two_doors"
+    with pytest.raises(ValueError, match=r"has no 'uper'\. Did you mean 'upper'\?"):
+        resolve("rater", f"{path}:uper")
+
+
+def test_a_file_imports_what_is_beside_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    for number, folder in enumerate(("one", "two")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "helping_hand.py").write_text(f"NUMBER = {number}\n")
+        (tmp_path / folder / "plug.py").write_text(
+            "from helping_hand import NUMBER\n\ndef rate(segments):\n    return NUMBER\n"
+        )
+    try:
+        assert resolve("rater", f"{tmp_path}/one/plug.py:rate")(None) == 0
+        with pytest.raises(ValueError, match=r"imports 'helping_hand'.*one.*rename one"):
+            resolve("rater", f"{tmp_path}/two/plug.py:rate")
+    finally:
+        sys.modules.pop("helping_hand", None)

@@ -21,6 +21,7 @@ from popl_rl.experiments.cells import Cell, is_finished
 from popl_rl.storage import write_json
 from popl_rl.trainers import train_popl
 from popl_rl.trainers.command import USER_ERRORS
+from popl_rl.trainers.typed import opened
 
 # One core for each cell; a benchmark's own report takes the place of a log of each.
 _ALWAYS = ("logger=csv", "threads=1")
@@ -84,10 +85,11 @@ def run_task(task: Task) -> str | None:
 
 def compose_train(overrides: Sequence[str]) -> Any:
     """Compose the configuration of ``popl-train`` from overrides, also inside of a Hydra job."""
+    given = opened(overrides)
     if GlobalHydra.instance().is_initialized():  # inside of a Hydra job
-        return compose("train", overrides=list(overrides))
+        return compose("train", overrides=given)
     with initialize_config_module("popl_rl.configs", version_base="1.3"):
-        return compose("train", overrides=list(overrides))
+        return compose("train", overrides=given)
 
 
 @contextlib.contextmanager

@@ -27,7 +27,7 @@ from popl_rl.config import (
     validate,
 )
 from popl_rl.trainers.spelling import explained
-from popl_rl.trainers.typed import as_typed
+from popl_rl.trainers.typed import as_typed, opened
 
 __all__ = [
     "USER_ERRORS",
@@ -64,6 +64,7 @@ def run_command(main: Callable[[], Any], schema: type = Config) -> None:
         schema: Dataclass of its settings, which what is misspelt is compared with.
     """
     logging.getLogger("torchrl").setLevel(logging.WARNING)
+    sys.argv[1:] = opened(sys.argv[1:])  # which Hydra reads
     if os.environ.get("HYDRA_FULL_ERROR") == "1":
         main()
         return

@@ -10,8 +10,6 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
 
-from popl_rl.config import OPEN
-
 __all__ = ["explained"]
 
 _WORDS = {
@@ -36,8 +34,6 @@ def explained(error: Exception, schema: type) -> str:
     if unknown:
         name = unknown[1]
         text = f"Could not override {name!r}: there is no such setting."
-        if name.startswith(tuple(f"{section}." for section in OPEN)):
-            return f"{text} Arguments of a factory are appended, as in +{name}=..."
         return f"{text}{_guess(name, list(_names(schema)))} --cfg job lists all settings."
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, choice = error.missing_cfg_file.partition("/")

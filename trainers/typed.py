@@ -1,5 +1,6 @@
-"""Text that Hydra would read as a number or as true and false, kept as it was typed."""
+"""What was typed, so that Hydra reads it as it was meant."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from types import UnionType
@@ -8,7 +9,24 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 
-__all__ = ["as_typed"]
+from popl_rl.config import OPEN
+
+__all__ = ["as_typed", "opened"]
+
+
+def opened(overrides: Sequence[str]) -> list[str]:
+    """Overrides whose arguments of a factory may be new, with the plus that Hydra wants there.
+
+    Args:
+        overrides: As typed, such as ``"env.options.size=7"`` or ``"env.mixture={gait:1}"``.
+    """
+    starts = tuple(f"{section}{end}" for section in OPEN for end in (".", "={"))
+    # Behaviours may be called go/left, or meant by a pattern: no names of settings to Hydra.
+    named = [
+        re.sub(r"^(\+*env\.mixture)\.([^=]*[^\w.=][^=]*)=(.*)$", r"\1={\2:\3}", one)
+        for one in overrides
+    ]
+    return [f"++{one}" if one.startswith(starts) else one for one in named]
 
 
 def as_typed(arguments: Sequence[str], schema: type) -> list[str]:

@@ -18,7 +18,8 @@ class EnvConfig:
     factory: str = "two_doors"  # registered name, module:attr or file.py:attr
     options: dict[str, Any] = field(default_factory=dict)  # arguments of the factory
     data_options: dict[str, Any] = field(default_factory=dict)  # on top of these, for data only
-    mixture: dict[str, float] | None = None  # share of behaviours in the data, by name or pattern
+    # Share of behaviours in the data, by name or pattern; all alike if empty or null.
+    mixture: dict[str, float] | None = field(default_factory=dict)
     id: str | None = None  # id of a Gymnasium environment, for env=gym
     max_steps: int = 60  # steps after which an episode is cut
     success: str = "goal"  # number in info that is positive when the task is done
@@ -35,7 +36,7 @@ class EnvConfig:
             at.expect(bool(self.id), "id", name, self.id)
         if self.id is not None:
             at.expect(bool(self.id), "id", "an id, or null", self.id)
-        if self.mixture is not None:
+        if self.mixture:
             proper = all(share >= 0 for share in self.mixture.values())
             proper = proper and abs(sum(self.mixture.values()) - 1) < 1e-6
             expected = "non-negative shares that sum to 1"

@@ -20,11 +20,11 @@ def changing_nothing(overrides: Sequence[str]) -> list[str]:
     """
     problems = []
     for override in overrides:
-        key, _, value = override.partition("=")
+        key, _, value = override.lstrip("+").partition("=")
         if value.replace(" ", "") == "{}":
-            cure = f"delete single entries, as in ~{key.lstrip('+~')}.name"
+            cure = f"delete single entries, as in ~{key.lstrip('~')}.name"
             cure = "give null for equal shares" if key == "env.mixture" else cure
-            problems.append(f"{override} changes nothing, because mappings are merged: {cure}")
+            problems.append(f"{key}={{}} changes nothing, because mappings are merged: {cure}")
     return problems
 
 

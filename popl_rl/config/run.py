@@ -76,7 +76,10 @@ class Config:
         for name in ("env", "raters", "data", "method", "evaluation", "people", "logger"):
             getattr(self, name).check(at.below(name))
         from_people = bool(self.raters.groups) or self.data.load is not None
-        cure = "one or more rater references, unless people's answers are in data.load"
+        cure = (
+            "one or more rater references, such as [my_raters.py:fast,my_raters.py:careful], "
+            "unless people's answers are in data.load"
+        )
         at.expect(from_people, "raters.groups", cure, self.raters.groups)
         proper = re.fullmatch(r"cpu|cuda(:\d{1,3})?", self.device)
         at.expect(proper is not None, "device", "cpu, cuda, or one of them, as cuda:1", self.device)

@@ -78,7 +78,7 @@ class Comparisons:
 
         Raises:
             ValueError: If ``cases`` or ``ties`` is none of these, rater ids are needed and
-                missing, or no answer is strict.
+                missing, answers are no ``popl_rl.keys.Answer``, or no answer is strict.
         """
         if cases not in ("preference", "rater"):
             raise ValueError(f"cases must be 'preference' or 'rater', got {cases!r}")
@@ -90,6 +90,7 @@ class Comparisons:
                 "ids use cases='preference'"
             )
         answer = preferences[ANSWER]
+        _check_answers(answer)
         counting = ties == "count" and cases == "rater"
         kept = answer <= (Answer.TIE if counting else Answer.SECOND)
         if not (answer <= Answer.SECOND).any():
@@ -155,6 +156,20 @@ class Comparisons:
             return value
         total = value.new_zeros(*value.shape[:-1], int(self.answer.max()) + 1)
         return total.index_add_(-1, self.answer, value)[..., self.answer]
+
+
+def _check_answers(answer: Tensor) -> None:
+    """Raise for what is no ``Answer``, such as -1 and 1, or numbers of segments."""
+    known = {int(one) for one in Answer}
+    found = answer.unique().tolist()
+    if answer.is_floating_point() or not known.issuperset(found):
+        listed = ", ".join(f"{one}" for one in found[:6]) + (", ..." if len(found) > 6 else "")
+        raise ValueError(
+            "answers must be 0 where the first segment of a pair is preferred, 1 where the second "
+            f"is, {int(Answer.TIE)} for a tie or {int(Answer.SKIP)} for none, as whole numbers, "
+            f"got {answer.dtype} with values {listed}; of -1 and 1, or of numbers of segments, "
+            "make the position of the preferred segment in its pair"
+        )
 
 
 def _named(rater: Tensor) -> Tensor:

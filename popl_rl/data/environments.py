@@ -6,6 +6,8 @@ border to learners, who count them from 0.
 """
 
 import fnmatch
+import importlib.util
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -35,6 +37,7 @@ __all__ = [
     "indexed",
     "is_stateless",
     "make_world",
+    "offered",
 ]
 
 MakeEnv = Callable[[], gymnasium.Env[Any, Any]]
@@ -89,7 +92,8 @@ def make_world(
 ) -> World:
     """Resolve an environment and read off what it offers.
 
-    An environment is any Gymnasium environment. Three methods are used if it has them:
+    An environment is any Gymnasium environment. Three methods are used if it, or a wrapper around
+    it, has them:
     ``transition_table()`` (exact regret labels), ``behaviours()`` (what the data shows: by name,
     tables ``[S, A]`` of action probabilities or functions; uniformly random otherwise), and
     ``collect_segments(...)`` (see ``Collect``), which collects the data itself.
@@ -109,6 +113,9 @@ def make_world(
     """
     make_env = cast("Callable[..., gymnasium.Env[Any, Any]]", resolve("env", factory))
     leading = () if env_id is None else (env_id,)
+    if env_id is not None and make_env is gymnasium.make:
+        make_env = partial(_make_by_id, env_id)
+        leading = ()
 
     def build(options: dict[str, Any]) -> gymnasium.Env[Any, Any]:
         try:
@@ -136,19 +143,40 @@ def make_world(
         return build({**(options or {}), **(data_options or {})})
 
     env = make()
-    inner = env.unwrapped
-    table = inner.transition_table() if hasattr(inner, "transition_table") else None
+    list_table, list_behaviours = offered(env, "transition_table"), offered(env, "behaviours")
+    table = None if list_table is None else list_table()
     first = first_action(env.action_space)
-    given = inner.behaviours() if hasattr(inner, "behaviours") else {}
+    given = {} if list_behaviours is None else list_behaviours()
     behaviours = {
         name: table_behaviour(what, first=first) if isinstance(what, Tensor) else what
         for name, what in given.items()
     } or {"random": random_behaviour(env.action_space)}
     shares = behaviour_shares(list(behaviours), mixture)
     collect = None
-    if hasattr(inner, "collect_segments"):
-        collect = cast("Any", make_for_data().unwrapped).collect_segments
+    if offered(env, "collect_segments") is not None:
+        collect = offered(make_for_data(), "collect_segments")
     return World(make, make_for_data, env, behaviours, shares, table, collect)
+
+
+def offered(env: gymnasium.Env[Any, Any], name: str) -> Any:
+    """What an environment or a wrapper around it has under a name, the outermost first, or None."""
+    return env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else None
+
+
+def _make_by_id(env_id: str, **options: Any) -> gymnasium.Env[Any, Any]:
+    """Make an environment by its id, importing the package that registers it if need be."""
+    try:
+        return gymnasium.make(env_id, **options)
+    except gymnasium.error.UnregisteredEnv as error:
+        # Packages register their ids when imported, and mostly begin them with their own name.
+        start = re.split(r"[-/:]", env_id, maxsplit=1)[0].lower()
+        for package in (start, f"{start}_py"):
+            if ":" not in env_id and package and importlib.util.find_spec(package) is not None:
+                return gymnasium.make(f"{package}:{env_id}", **options)
+        raise gymnasium.error.UnregisteredEnv(
+            f"{error} Ids of other packages begin with the package that is to be imported, as in "
+            "env.id=minigrid:MiniGrid-Empty-5x5-v0."
+        ) from error
 
 
 def behaviour_shares(names: Sequence[str], mixture: Mapping[str, float] | None) -> dict[str, float]:
@@ -157,12 +185,12 @@ def behaviour_shares(names: Sequence[str], mixture: Mapping[str, float] | None) 
     Args:
         names: Behaviours that there are.
         mixture: Shares by name or by pattern (``"planner/*"``), which the matching behaviours
-            divide equally; None for equal shares of all.
+            divide equally; None or empty for equal shares of all.
 
     Raises:
         ValueError: If a pattern matches nothing.
     """
-    if mixture is None:
+    if not mixture:
         return dict.fromkeys(names, 1 / len(names))
     shares = dict.fromkeys(names, 0.0)
     for pattern, share in mixture.items():

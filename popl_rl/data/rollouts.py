@@ -46,7 +46,8 @@ def lockstep(
     Returns:
         TensorDict of batch size ``[B, H]`` with ``observation``, ``action``, ``reward``,
         ``("info", ...)`` (that of the step's outcome) and ``mask``; steps after an episode's end
-        hold zeros and ``mask`` False.
+        hold zeros and ``mask`` False. A number that an ``info`` lacks counts as 0 there, and one
+        that no reset gives is not shown to ``act`` before the first step.
 
     Raises:
         ValueError: If there are no environments, the numbers of environments and seeds differ, or
@@ -61,7 +62,7 @@ def lockstep(
     starts = [env.reset(seed=int(seed)) for env, seed in zip(envs, seeds, strict=True)]
     observation = np.stack([np.asarray(start[0], dtype=np.float32) for start in starts])
     infos = [start[1] for start in starts]
-    names = list(numeric_info(infos[0]))
+    names = _Names(infos)
     steps = [env.step for env in envs]
     info = _stack_info(infos, names)
     alive = np.ones(len(envs), dtype=bool)
@@ -78,6 +79,7 @@ def lockstep(
             observation[index], reward[index], ended, cut, infos[index] = outcome
             if ended or cut:
                 alive[index] = False
+            names.add(infos[index])
         info = _stack_info(infos, names)
         frames.append((seen, action, reward, mask, info))
         if not alive.any():
@@ -88,7 +90,7 @@ def lockstep(
             OBSERVATION: torch.stack(observations, 1),
             ACTION: torch.stack(actions, 1),
             REWARD: torch.from_numpy(np.stack(rewards, 1)),
-            INFO: {name: torch.stack([each[name] for each in about], 1) for name in names},
+            INFO: {name: _over_time(about, name) for name in names.known},
             MASK: torch.from_numpy(np.stack(masks, 1)),
         },
         [len(envs), len(frames)],
@@ -100,11 +102,37 @@ def lockstep(
     return episodes
 
 
-def _stack_info(infos: Sequence[dict[str, Any]], names: Sequence[str]) -> dict[str, Tensor]:
-    """Column ``[B]`` of each name: bool, int64 or float32."""
+class _Names:
+    """Names of the numbers in infos, in the order in which they come up."""
+
+    def __init__(self, infos: Sequence[dict[str, Any]]) -> None:
+        self.known: dict[str, None] = {}
+        self._seen: set[str] = set()
+        for info in infos:
+            self.add(info)
+
+    def add(self, info: dict[str, Any]) -> None:
+        """Look whether there are new ones; where there are none, this is no more than a look."""
+        if not info.keys() <= self._seen:
+            numbers = numeric_info(info)
+            self.known |= dict.fromkeys(numbers)
+            # What is no number may be one at another step.
+            self._seen |= numbers.keys()
+
+
+def _stack_info(infos: Sequence[dict[str, Any]], names: _Names) -> dict[str, Tensor]:
+    """Column ``[B]`` of each name: bool, int64 or float32; 0 where an info lacks it."""
     columns = {}
-    for name in names:
-        column = np.array([info[name] for info in infos])
+    for name in names.known:
+        column = np.array([info.get(name, 0) for info in infos])
+        if column.dtype.kind not in "biuf":
+            column = np.array([numeric_info(info).get(name, 0) for info in infos])
         kind = {"b": np.bool_, "i": np.int64, "u": np.int64}.get(column.dtype.kind, np.float32)
         columns[name] = torch.from_numpy(column.astype(kind, copy=False))
     return columns
+
+
+def _over_time(columns: Sequence[dict[str, Tensor]], name: str) -> Tensor:
+    """The columns of a name as ``[B, H]``; 0 before the step at which it first comes up."""
+    first = next(each[name] for each in columns if name in each)
+    return torch.stack([each.get(name, torch.zeros_like(first)) for each in columns], 1)

@@ -13,6 +13,7 @@ from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayB
 
 from popl_rl.data.behaviours import Behaviour
 from popl_rl.data.rollouts import MASK, lockstep
+from popl_rl.keys import INFO
 
 __all__ = ["collect_segments", "cut_segments", "segment_buffer", "stored_segments"]
 
@@ -116,8 +117,17 @@ def collect_segments(
     finally:
         for env in envs:
             env.close()
-    everything: TensorDict = torch.cat(collected)  # type: ignore[call-overload]
+    everything: TensorDict = torch.cat(_alike(collected))  # type: ignore[call-overload]
     return everything[torch.randperm(total, generator=generator)]
+
+
+def _alike(batches: list[TensorDict]) -> list[TensorDict]:
+    """Batches with the same numbers in ``info``: 0 where none of a batch's infos had one."""
+    names = [set(batch[INFO].keys()) for batch in batches]
+    for batch, own in zip(batches, names, strict=True):
+        for name in sorted(set().union(*names) - own):
+            batch[INFO, name] = torch.zeros(batch.batch_size)
+    return batches
 
 
 def _check_counts(counts: Mapping[str, int]) -> None:

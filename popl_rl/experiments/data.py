@@ -150,6 +150,7 @@ def describe(env: EnvConfig, config: DataConfig, *, seed: int) -> dict[str, Any]
     # A node of a larger configuration may refer to other nodes of it.
     node = env if isinstance(env, DictConfig) else OmegaConf.structured(env)
     described: Any = OmegaConf.to_container(node, resolve=True)
+    described["mixture"] = described["mixture"] or None  # both are equal shares
     return {
         "format": 1,
         "env": {name: described[name] for name in names},

@@ -81,7 +81,10 @@ def evolve_people(
             trainer.train()
         return method.result()
 
-    return train_on(people, fold, config, config.method.name, run=run)
+    trained = train_on(people, fold, config, config.method.name, run=run)
+    if trained.found is not None:
+        trained.found.fair_member = trained.found.fair_among(people.bank, fold.training)
+    return trained
 
 
 def compare_methods(

@@ -232,6 +232,7 @@ def evolve(
         history.truncate_to(done)
         trainer.train()
     found = method.result()
+    found.fair_member = found.fair_among(setting.problem.bank, setting.problem.comparisons)
     save_anew(found, run_dir / found.folder)
     _write_sizes(method, run_dir / "sizes.csv")
     return found

@@ -115,7 +115,7 @@ class _Encoded(HypothesisSet):
 
         Args:
             segments: What the answers are about.
-            answers: TensorDict ``[K]`` with ``pair`` and ``answer``; ties and skips are ignored.
+            answers: As for ``HypothesisSet.cater``; none gives the fair choice there too.
             method: ``"posterior"``: belief ``w_n ~ q(z_n | answers)`` of the encoder, and the one
                 believed in most, the nearest in units of the encoder's standard deviations.
                 ``"lexicase"``: as ``HypothesisSet.cater``.
@@ -125,7 +125,7 @@ class _Encoded(HypothesisSet):
         Raises:
             ValueError: If no answer is strict, or the arguments are off.
         """
-        if method != "posterior":
+        if method != "posterior" or not len(answers):
             return super().cater(
                 segments, answers, method=method, mistake=mistake, generator=generator
             )
@@ -146,7 +146,7 @@ class _Encoded(HypothesisSet):
             alpha=self.alpha,
             discount=self.discount,
         )
-        chosen.origin = [self.origin[member] for member in members]
+        self._tell(chosen, members)
         return chosen
 
     def _write_more(self, folder: Path) -> None:

@@ -57,6 +57,8 @@ class HypothesisSet:
 
     Attributes:
         origin: Member of the trained population that each one is; empty if it is none of them.
+        fair_member: The fair choice for the raters of the training, for people who have said
+            nothing yet; None where nobody has made it.
     """
 
     folder: ClassVar[str]  #: of a run, in which it is kept
@@ -70,6 +72,7 @@ class HypothesisSet:
         self.alpha = alpha
         self.discount = discount
         self.origin = list(range(len(population)))
+        self.fair_member: int | None = None
 
     def distinct(self, bank: SegmentBank, comparisons: Comparisons) -> Self:
         """Keep one member for each distinct row of passes ``[M]``, the first with that row."""
@@ -128,7 +131,10 @@ class HypothesisSet:
 
         Args:
             segments: What the answers are about.
-            answers: TensorDict ``[K]`` with ``pair`` and ``answer``; ties and skips are ignored.
+            answers: TensorDict ``[K]`` with ``pair`` (rows of two of the segments) and ``answer``
+                (a ``popl_rl.keys.Answer``: 0 where the first of the two is preferred, 1 where the
+                second is); ties and skips are ignored. Without any answer the choice is the fair
+                one of the raters of the training, ``fair_member``.
             method: ``"posterior"``: belief ``w_n ~ prod_k p(answer_k | Delta_nk)`` with ``p = (1 -
                 mistake) sigmoid(Delta) + mistake sigmoid(-Delta)``, and the one believed in
                 most. ``"lexicase"``: one lexicase selection over the answers, as in the POPL
@@ -140,9 +146,12 @@ class HypothesisSet:
             The chosen member, and the belief in each, ``[N]``.
 
         Raises:
-            ValueError: If no answer is strict, ``method`` is unknown, ``mistake`` is outside
-                [0, 0.5) or ``generator`` is missing.
+            ValueError: If answers are no such numbers or all ties and skips, there are none and
+                ``fair_member`` is unknown, ``method`` is unknown, ``mistake`` is outside [0, 0.5)
+                or ``generator`` is missing.
         """
+        if not len(answers):
+            return self._unasked()
         comparisons = Comparisons.from_preferences(answers, cases="preference")
         margin = self.margins(segments, comparisons).cpu()
         if method == "posterior":
@@ -154,6 +163,15 @@ class HypothesisSet:
             member = int(lexicase_selection(margin > 0, 1, generator=generator))
             return Catered(member, F.one_hot(torch.tensor(member), len(self)).float())
         raise ValueError(f"method must be 'posterior' or 'lexicase', got {method!r}")
+
+    def _unasked(self) -> Catered:
+        """What somebody is given who has said nothing."""
+        if self.fair_member is None:
+            raise ValueError(
+                "answers must hold at least one answer, since this set does not know its fair "
+                "choice (fair_member is None); set it to fair(segments, preferences)"
+            )
+        return Catered(self.fair_member, torch.full((len(self),), 1 / len(self)))
 
     def next_question(
         self,
@@ -242,8 +260,19 @@ class HypothesisSet:
         if not 0 <= quantile <= 1:
             raise ValueError(f"quantile must be in [0, 1], got {quantile}")
         comparisons = Comparisons.from_preferences(answers, cases="rater")
+        return self.fair_among(segments, comparisons, quantile=quantile)
+
+    def fair_among(
+        self,
+        segments: TensorDictBase | SegmentBank,
+        comparisons: Comparisons,
+        *,
+        quantile: float = 0.1,
+    ) -> int:
+        """As ``fair``, from comparisons; the most accurate one where nobody's are known by id."""
         values = case_values(self.margins(segments, comparisons).cpu() > 0, comparisons)
-        return int(values.quantile(quantile, dim=1).argmax())
+        by_case = values.mean(1) if comparisons.is_single else values.quantile(quantile, dim=1)
+        return int(by_case.argmax())
 
     def save(self, path: Path | str) -> None:
         """Write the set as tensors and JSON; nothing is left half-written.
@@ -261,6 +290,7 @@ class HypothesisSet:
             "alpha": self.alpha,
             "discount": self.discount,
             "origin": self.origin,
+            "fair_member": self.fair_member,
             "trunk": trunk,
         }
         with written_beside(Path(path)) as beside:
@@ -328,6 +358,8 @@ class HypothesisSet:
             scale = {name: float(about[name]) for name in ("alpha", "discount")}
             loaded = cls._assemble(population, path, **scale)
             loaded.origin = [int(member) for member in about["origin"]]
+            fair = about.get("fair_member")  # sets of earlier versions do not know it
+            loaded.fair_member = None if fair is None else int(fair)
         except (
             AttributeError,
             FileNotFoundError,
@@ -347,5 +379,11 @@ class HypothesisSet:
         chosen = type(self)(
             self.population.subset(members), alpha=self.alpha, discount=self.discount
         )
-        chosen.origin = [self.origin[member] for member in members] if self.origin else []
+        self._tell(chosen, members)
         return chosen
+
+    def _tell(self, chosen: "HypothesisSet", members: Sequence[int]) -> None:
+        """Tell a set of some members of this one what this one knows of them."""
+        chosen.origin = [self.origin[member] for member in members] if self.origin else []
+        if self.fair_member is not None and self.fair_member in members:
+            chosen.fair_member = list(members).index(self.fair_member)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
 from popl_rl.algorithms.reward_baselines import RewardBaselines
-from popl_rl.data.environments import World
+from popl_rl.data.environments import World, offered
 from popl_rl.data.rollouts import MASK
 from popl_rl.evaluation.evaluator import Evaluator
 from popl_rl.evaluation.method_names import method_name
@@ -99,7 +99,7 @@ def draw(
     if history.exists() and len(evaluator.groups) > 1:
         snapshots = pd.read_csv(history)
         figures["members"] = _draw_members(snapshots, found, baselines, board, evaluator)
-    cells = getattr(world.env.unwrapped, "cells", None)
+    cells = offered(world.env, "cells")
     if cells is not None:
         figures["occupancy"] = _draw_occupancy(cells, board, evaluator, world)
     figures |= draw_motion(found, board=board, evaluator=evaluator)

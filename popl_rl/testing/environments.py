@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from popl_rl.data.environments import offered
 from popl_rl.testing.env_parts import (
     check_behaviours,
     check_repeats,
@@ -10,7 +11,7 @@ from popl_rl.testing.env_parts import (
     check_torchrl,
     random_steps,
 )
-from popl_rl.testing.plug_ins import EnvReference, call, made_env, name_of, offers
+from popl_rl.testing.plug_ins import EnvReference, call, made_env, name_of
 
 __all__ = ["check_env"]
 
@@ -39,10 +40,10 @@ def check_env(env: EnvReference, *, num_steps: int = 200, seed: int = 0, **argum
         check_spaces(name, made)
         steps = random_steps(name, made, num_steps, seed)
         check_repeats(name, steps, random_steps(name, made, num_steps, seed))
-        if offers(made, "transition_table"):
-            table = call("env", name, "transition_table", offers(made, "transition_table"))
+        if offered(made, "transition_table"):
+            table = call("env", name, "transition_table", offered(made, "transition_table"))
             check_table(name, table, made, steps)
-        if offers(made, "behaviours"):
-            found = call("env", name, "behaviours", offers(made, "behaviours"))
+        if offered(made, "behaviours"):
+            found = call("env", name, "behaviours", offered(made, "behaviours"))
             check_behaviours(name, found)
         check_torchrl(name, made)

@@ -20,7 +20,6 @@ __all__ = [
     "identical",
     "made_env",
     "name_of",
-    "offers",
     "random_segments",
 ]
 
@@ -81,11 +80,6 @@ def made_env(name: str, env: EnvReference, arguments: dict[str, Any]) -> Iterato
         yield made
     finally:
         made.close()
-
-
-def offers(env: Env, method: str) -> Any:
-    """Return an optional method of an environment, below its wrappers, or None."""
-    return getattr(env.unwrapped, method, None)
 
 
 def random_segments(env: Env, seed: int) -> TensorDictBase:

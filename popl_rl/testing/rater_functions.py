@@ -6,6 +6,7 @@ from typing import Any
 import torch
 
 from popl_rl import registry
+from popl_rl.data.environments import offered
 from popl_rl.raters.groups import RaterGroup, Utility
 from popl_rl.raters.response import Response
 from popl_rl.testing.plug_ins import (
@@ -13,7 +14,6 @@ from popl_rl.testing.plug_ins import (
     identical,
     made_env,
     name_of,
-    offers,
     random_segments,
 )
 from popl_rl.testing.tiny import tiny_env
@@ -52,7 +52,7 @@ def check_rater(
     source = tiny_env if env is None else env
     with made_env(name_of(source), source, arguments) as made:
         segments = random_segments(made, seed)
-        list_table = offers(made, "transition_table")
+        list_table = offered(made, "transition_table")
         table = list_table() if list_table else None
     before = segments.clone()
     whole = group.step_utility(segments)

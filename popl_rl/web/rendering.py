@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from popl_rl.data.environments import World
+from popl_rl.data.environments import World, offered
 from popl_rl.keys import ACTION, OBSERVATION
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.sets import load_set
@@ -129,9 +129,9 @@ def _rendered(
 def _records(scenes: Scenes) -> bool:
     """Whether segments are shown by collecting them again, all at once."""
     world = scenes.make_world()
-    inner = world.env.unwrapped
+    records = offered(world.env, "record_segments") is not None
     world.env.close()
-    return hasattr(inner, "record_segments")
+    return records
 
 
 def _render_segments(scenes: Scenes, wanted: list[int]) -> None:
@@ -139,21 +139,23 @@ def _render_segments(scenes: Scenes, wanted: list[int]) -> None:
     torch.set_num_threads(1)
     segments = load_tensordict(scenes.source / "segments")
     segments.auto_batch_size_(2)
-    env: Any = scenes.make_world().make_for_data().unwrapped
+    env = scenes.make_world().make_for_data()
     rate = float(env.metadata.get("render_fps", _RATE))
-    if hasattr(env, "record_segments"):
+    record, render = offered(env, "record_segments"), offered(env, "render_segment")
+    describe = offered(env, "describe_segment")
+    if record is not None:
 
         def keep(index: int, frames: list[Any]) -> None:
             write_clip(film_strip(frames, rate=_FILM_RATE), scenes.folder, index)
 
-        env.record_segments(segments, set(wanted), keep, generator=stream(scenes.seed, "segments"))
+        record(segments, set(wanted), keep, generator=stream(scenes.seed, "segments"))
         return
     for index in wanted:
         segment = segments[index]
-        if hasattr(env, "render_segment"):
-            clip = film_strip(env.render_segment(segment), rate=min(rate, _RATE))
-        elif hasattr(env, "describe_segment"):
-            clip = Clip(text=env.describe_segment(segment))
+        if render is not None:
+            clip = film_strip(render(segment), rate=min(rate, _RATE))
+        elif describe is not None:
+            clip = Clip(text=describe(segment))
         else:
             clip = Clip(text=_numbers(segment))
         write_clip(clip, scenes.folder, index)

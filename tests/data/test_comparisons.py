@@ -90,6 +90,13 @@ def test_ties_and_skips_alone_are_refused():
         Comparisons.from_preferences(make([[0, 1], [1, 2]], [TIE, SKIP]), cases="preference")
 
 
+@pytest.mark.parametrize("said", [[-1, 1], [4, 7], [0.0, 1.0]])
+def test_answers_are_positions_in_the_pair(said):
+    """Signs and numbers of segments would choose the other group's policy, or end in an index."""
+    with pytest.raises(ValueError, match="must be 0 where the first segment of a pair is"):
+        Comparisons.from_preferences(make([[4, 7], [7, 4]], said), cases="preference")
+
+
 def test_rater_cases_need_raters(five):
     del five["rater"]
     message = "preferences must hold 'rater', .* without ids use cases='preference'"

@@ -119,6 +119,20 @@ def test_catering_needs_a_strict_answer(two, steps):
         two.cater(steps, answers(TIE, SKIP))
 
 
+def test_somebody_who_has_said_nothing_gets_the_fair_choice(two, steps, tmp_path):
+    nothing = answers()
+    with pytest.raises(ValueError, match=r"fair_member is None.*fair\(segments, preferences\)"):
+        two.cater(steps, nothing)
+    two.fair_member = two.fair(steps, answers(SECOND, SECOND, raters=[0, 1]))
+    assert two.fair_member == 1
+    for one in (two, two.subset([1])):
+        choice = one.cater(steps, nothing)
+        assert choice.member == len(one) - 1
+        assert choice.weights.tolist() == [1 / len(one)] * len(one)
+    two.save(tmp_path / "set")
+    assert PolicySet.load(tmp_path / "set").fair_member == 1
+
+
 @pytest.mark.parametrize(("quantile", "fairest"), [(0.1, 1), (0.0, 1), (0.5, 0), (1.0, 0)])
 def test_fairness_by_hand(monkeypatch, two, steps, quantile, fairest):
     """Four raters with two answers each.

@@ -171,7 +171,6 @@ def test_what_the_user_can_put_right(train, overrides, parts):
         ),
         (["raters.response.mistakes=0.2"], ["Did you mean 'raters.response.mistake'? --cfg job"]),
         (["mistake=0.2"], ["Did you mean 'raters.response.mistake'?"]),
-        (["env.options.door=3"], ["appended, as in +env.options.door=..."]),
         (["raters=three_group"], ["unknown raters 'three_group'. Did you mean 'three_groups'?"]),
         (["env=metaworld/drawer"], ["unknown env 'metaworld/drawer'.", "Known:", "two_doors"]),
         (["method=pople"], ["unknown method 'pople'. Did you mean 'popl'? Known: cpl, em, "]),
