@@ -96,12 +96,12 @@ def prepare(config: LabelConfig) -> Labelling:
 
 def _material(config: LabelConfig, out: Path) -> tuple[list[tuple[int, int]], "Clips"]:
     """Which pairs are compared, and what people see of them."""
+    from popl_rl.data.saved import load_segments
     from popl_rl.experiments.data import build_world
     from popl_rl.experiments.label_data import gather_segments
     from popl_rl.experiments.loggers import Progress
     from popl_rl.models.sets import load_set
     from popl_rl.randomness import stream
-    from popl_rl.storage import load_tensordict
     from popl_rl.web.labels import choose_pairs, kept_pairs
     from popl_rl.web.rendering import Scenes, segment_clips
 
@@ -110,8 +110,7 @@ def _material(config: LabelConfig, out: Path) -> tuple[list[tuple[int, int]], "C
         seed = gather_segments(config.data, env, out, seed=config.seed, progress=progress.update)
     chosen = None
     if not (out / "pairs.json").exists():
-        segments = load_tensordict(out / "segments")
-        segments.auto_batch_size_(2)
+        segments = load_segments(out / "segments")
         chosen = choose_pairs(
             segments,
             options.pairs,

@@ -99,9 +99,9 @@ def prepare(config: ServeConfig) -> Serving:
 def _caterer(config: ServeConfig, run_dir: Path, world: "World") -> "Caterer":
     """The set of a run, and what people may be asked about."""
     from popl_rl.data.environments import indexed
+    from popl_rl.data.saved import load_segments
     from popl_rl.models.sets import load_set
     from popl_rl.randomness import stream
-    from popl_rl.storage import load_tensordict
     from popl_rl.web.catering import Caterer, candidate_pairs
     from popl_rl.web.person_store import PersonStore
 
@@ -109,8 +109,7 @@ def _caterer(config: ServeConfig, run_dir: Path, world: "World") -> "Caterer":
     policies = load_set(_place(run_dir))
     if not (data / "segments").is_dir():
         raise ValueError(f"{run_dir} holds no data to ask about; train with data.save=true")
-    segments = load_tensordict(data / "segments")
-    segments.auto_batch_size_(2)
+    segments = load_segments(data / "segments")
     read = indexed(segments, world.env.action_space)
     generator = stream(config.seed, "candidates")
     pairs = candidate_pairs(

@@ -2,7 +2,8 @@
 
 * ``environments``: environments built from settings; ``tables``: their transitions, solved exactly.
 * ``behaviours``: who acts while data are collected; ``rollouts``: whole episodes in lockstep.
-* ``segments``: episodes cut into segments; ``store``: segments that several runs share.
+* ``segments``: episodes cut into segments; ``store``: segments that several runs share;
+  ``saved``: segments and preferences in a folder, checked whenever they are read.
 * ``pairs``: random pairs of segments that may be compared.
 * ``readers``: other people's data, from csv, jsonl, parquet, npz, Minari, chosen and rejected.
 * ``bank``: segments as scoring reads them; ``comparisons``: preferences as learning reads them.

@@ -1,6 +1,8 @@
 """Behaviour data: episodes, cut into fixed-length segments, stored once in a replay buffer."""
 
+import shutil
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,11 +11,14 @@ import gymnasium
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorStorage
 
 from popl_rl.data.behaviours import Behaviour
 from popl_rl.data.rollouts import MASK, lockstep
 from popl_rl.keys import INFO
+from popl_rl.locks import locked
+from popl_rl.manifest import digest_of_tensors
+from popl_rl.storage import map_tensordict, save_tensordict
 
 __all__ = ["collect_segments", "cut_segments", "segment_buffer", "stored_segments"]
 
@@ -163,20 +168,38 @@ def segment_buffer(
 
     Args:
         segments: ``[N, T]``.
-        memmap: Folder for memory-mapped storage; in memory if None.
+        memmap: Folder for memory-mapped storage; in memory if None. Each data set has a folder of
+            its own below it, named after its digest, which is made once and read again by whoever
+            has the same segments.
         batch_size: Segments per ``sample()``.
 
     Returns:
         A buffer of N items, in the order of ``segments``.
+
+    Raises:
+        OSError: If there is no room for memory-mapped storage.
     """
     size = len(segments)
-    storage = (
-        LazyTensorStorage(size) if memmap is None else LazyMemmapStorage(size, scratch_dir=memmap)
-    )
-    buffer = TensorDictReplayBuffer(storage=storage, batch_size=min(batch_size, size))
     # One item is one segment: the time axis belongs to the leaves, not to the batch.
-    buffer.extend(segments.copy().auto_batch_size_(1))
+    items = segments.copy().auto_batch_size_(1)
+    storage = LazyTensorStorage(size) if memmap is None else TensorStorage(_mapped(items, memmap))
+    buffer = TensorDictReplayBuffer(storage=storage, batch_size=min(batch_size, size))
+    if memmap is None:
+        buffer.extend(items)
     return buffer
+
+
+def _mapped(segments: TensorDictBase, folder: Path) -> TensorDict:
+    """The same segments as memory maps, checked to be the same to the last byte."""
+    digest = digest_of_tensors(segments)[""]
+    path = folder / f"segments-{digest}"
+    with locked(path):
+        if path.is_dir():
+            with suppress(Exception):  # whatever is wrong with a copy, it is made anew
+                return map_tensordict(path, digest=digest)
+            shutil.rmtree(path)
+        save_tensordict(segments, path)
+        return map_tensordict(path, digest=digest)
 
 
 def stored_segments(buffer: TensorDictReplayBuffer) -> TensorDict:

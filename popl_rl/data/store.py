@@ -9,9 +9,13 @@ from typing import Any
 
 from tensordict import TensorDictBase
 
-from popl_rl.storage import locked, save_tensordict, written_beside
+from popl_rl.locks import locked
+from popl_rl.manifest import read_sealed, sealed
+from popl_rl.storage import read_manifest, save_tensordict, write_json, written_beside
 
 __all__ = ["store_path", "stored"]
+
+_ABOUT = "made by"
 
 
 def store_path(root: Path, name: str, about: Mapping[str, Any]) -> Path:
@@ -51,23 +55,28 @@ def stored(path: Path, about: Mapping[str, Any], make: Callable[[], TensorDictBa
         data = make()
         with written_beside(path) as beside:
             save_tensordict(data, beside / "segments")
-            text = json.dumps(about, indent=2, sort_keys=True)
-            (beside / "about.json").write_text(text, encoding="utf-8")
+            manifest = read_manifest(beside / "segments")
+            assert manifest is not None
+            write_json(
+                beside / "about.json", sealed({_ABOUT: about, "segments": manifest["digest"]})
+            )
     return segments
 
 
 def _check(path: Path, about: Mapping[str, Any]) -> None:
-    """Raise unless a folder says that it holds what is wanted."""
+    """Raise unless a folder says that it holds what is wanted.
+
+    Folders of earlier versions have no seal and no digest; their segments are read with a warning.
+    """
     record = path / "about.json"
+    cure = "remove it to collect them again, or choose another data.store"
     try:
-        found = json.loads(record.read_text(encoding="utf-8"))
+        found = read_sealed(record, cure=cure)
     except (OSError, ValueError) as error:
-        raise ValueError(
-            f"{path} is not a folder of stored segments ({error}); remove it to collect them "
-            "again, or choose another data.store"
-        ) from error
-    if found != json.loads(json.dumps(about)):
-        raise ValueError(
-            f"{path} holds segments of other settings, see {record}; remove it to collect them "
-            "again, or choose another data.store"
-        )
+        raise ValueError(f"{path} is not a folder of stored segments ({error}); {cure}") from error
+    is_old = found.pop("seal", "") is None
+    if (found if is_old else found.get(_ABOUT)) != json.loads(json.dumps(about)):
+        raise ValueError(f"{path} holds segments of other settings, see {record}; {cure}")
+    manifest = read_manifest(path / "segments")
+    if (None if manifest is None else manifest["digest"]) != found.get("segments" * (not is_old)):
+        raise ValueError(f"{path} holds other segments than {record} says; {cure}")

@@ -1,8 +1,8 @@
 """Runs and benchmarks: from settings to objects, to files and to reports.
 
-- From settings: ``builders`` makes what is learnt, ``data`` the segments and preferences,
-  ``label_data`` segments for people to compare, and ``evaluators`` the evaluator. Settings objects
-  go no further than this package.
+- From settings: ``builders`` makes what is learnt, ``data`` the segments and preferences
+  (``asked`` keeps which groups gave them), ``label_data`` segments for people to compare, and
+  ``evaluators`` the evaluator. Settings objects go no further than this package.
 - A run's folder: ``run_folder``, ``metrics``, ``loggers``, and its ``report``.
 - A benchmark: ``suites`` reads what is compared, ``cells`` plans it and collects what came out,
   ``jobs`` runs it in processes, ``benchmark_tables`` and ``benchmark_report`` tell the results.

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import gymnasium
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 
 from popl_rl.algorithms.cpl import GroupCPL, group_weights, train
 from popl_rl.algorithms.problem import Method, Problem
@@ -16,6 +16,8 @@ from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.data.environments import is_stateless
 from popl_rl.keys import ANSWER, GROUP, Answer
+from popl_rl.locks import locked
+from popl_rl.manifest import digest_of_tensors
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.reward_functions import RewardSpec
@@ -23,7 +25,6 @@ from popl_rl.models.sets import load_set
 from popl_rl.models.style_codes import StyleClone, load_clone, save_clone, train_clone
 from popl_rl.randomness import stream
 from popl_rl.registry import resolve
-from popl_rl.storage import locked
 
 __all__ = [
     "build_clone",
@@ -76,9 +77,12 @@ def build_clone(
     how = config.clone
     settings = (how.code_dim, how.steps, how.beta, *spec.hidden)
     path = path / "-".join(map(str, (f"clone-seed{seed}", *settings)))
+    digest = digest_of_tensors(
+        TensorDict({"observation": bank.observation, "row": bank.row, "action": bank.action})
+    )[""]
     with locked(path):
         if path.is_dir():
-            return load_clone(spec, path).to(bank.row.device)
+            return load_clone(spec, path, bank=digest).to(bank.row.device)
         clone = train_clone(
             spec,
             bank,
@@ -88,7 +92,7 @@ def build_clone(
             generator=stream(seed, "clone", bank.row.device),
             progress=progress,
         )
-        save_clone(clone, path)
+        save_clone(clone, path, bank=digest)
     return clone
 
 

@@ -1,10 +1,9 @@
 """The data of a run: segments, collected or loaded, and what raters say of them."""
 
-import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,17 +17,27 @@ from popl_rl.config import DataConfig, EnvConfig, RatersConfig
 from popl_rl.data.environments import World, make_world
 from popl_rl.data.readers.imported import Imported
 from popl_rl.data.readers.opening import open_data
+from popl_rl.data.saved import (
+    check_preferences,
+    check_segments,
+    load_preferences,
+    load_segments,
+    save_preferences,
+    segments_digest,
+)
 from popl_rl.data.segments import collect_segments, segment_buffer, stored_segments
 from popl_rl.data.store import store_path, stored
-from popl_rl.keys import ACTION, GROUP, INFO, OBSERVATION
+from popl_rl.experiments.asked import check_asked, write_groups
+from popl_rl.keys import GROUP, INFO, OBSERVATION
+from popl_rl.manifest import digest_of_tensors
 from popl_rl.randomness import stream
-from popl_rl.raters.collector import check_preferences, collect_preferences, load_preferences
+from popl_rl.raters.collector import collect_preferences
 from popl_rl.raters.groups import RaterGroup, make_groups
 from popl_rl.raters.pairs import training_pool
 from popl_rl.raters.people import Raters
 from popl_rl.raters.response import Response
 from popl_rl.raters.values import with_values
-from popl_rl.storage import load_tensordict, save_tensordict, write_json
+from popl_rl.storage import save_tensordict
 
 __all__ = [
     "Data",
@@ -45,9 +54,6 @@ __all__ = [
 #: Reads other people's data: path -> segments ``[N, T]`` with ``observation`` and ``action``, and
 #: preferences ``[M]`` with ``pair``, ``answer`` and ``rater``.
 Reader = Callable[[Path], tuple[TensorDictBase, TensorDict] | Imported]
-
-#: Beside saved preferences: names of the groups.
-_ABOUT = "about.json"
 
 
 def build_world(config: EnvConfig) -> World:
@@ -123,11 +129,27 @@ class Data:
         """The segments as a TensorDict ``[N, T]``."""
         return stored_segments(self.segments)
 
-    def save(self, path: Path) -> None:
+    @cached_property
+    def digests(self) -> dict[str, str]:
+        """Of ``segments`` and ``preferences``, by which they are known again."""
+        return {
+            "segments": digest_of_tensors(self.steps)[""],
+            "preferences": digest_of_tensors(self.preferences)[""],
+        }
+
+    def save(self, path: Path, *, about: Mapping[str, Any] | None = None) -> None:
         """Write segments and preferences below ``path``, replacing nothing.
 
         Stored segments are not written again: a link leads to them. Where preferences say which
-        group each rater is of, ``about.json`` beside them says which groups these are.
+        group each rater is of, ``about.json`` beside them says which groups these are. The
+        preferences' manifest says so too, and which segments they compare.
+
+        Args:
+            path: The folder.
+            about: What else the preferences' manifest says, such as the id of the run.
+
+        Raises:
+            OSError: If there is no room.
         """
         segments = path / "segments"
         if not segments.exists():
@@ -139,9 +161,16 @@ class Data:
                 segments.symlink_to(os.path.relpath(self.store, path))
         if not (path / "preferences").exists():
             # First, so that preferences are never without it.
+            kept = dict(about or {})
             if GROUP in self.preferences.keys(True):
-                write_json(path / _ABOUT, {"groups": list(self.groups)})
-            save_tensordict(self.preferences, path / "preferences")
+                kept["groups"] = list(self.groups)
+                write_groups(path, self.groups)
+            save_preferences(
+                self.preferences,
+                path / "preferences",
+                segments=self.digests["segments"],
+                about=kept,
+            )
 
 
 def describe(env: EnvConfig, config: DataConfig, *, seed: int) -> dict[str, Any]:
@@ -189,88 +218,89 @@ def make_data(
         ValueError: If there is less data than was asked for, it does not fit the environment, or
             other groups were asked, or in another order, than ``groups``.
     """
-    data_seed = seed if config.seed is None else config.seed
     read = None if reader is None or load is None else _read(reader, load, config, world)
-    source, folder = None, None if load is None else load / "segments"
     if read is not None:
-        segments, folder = read[0], None
-    elif load is None:
-
-        def collect() -> TensorDictBase:
-            return _collect(config, world, env, stream(data_seed, "segments"), progress)
-
-        if config.store is None:
-            segments = collect()
-        else:
-            about = describe(env, config, seed=data_seed)
-            name = "-".join([env.factory, *map(str, env.options.values())][:2])
-            path = store_path(Path(config.store), name, about)
-            folder = source = stored(path, about, collect)
-    elif (load / "segments").is_symlink():
-        source = (load / "segments").resolve()
-    if folder is not None:
-        segments = _load(folder, config, world)
-        if progress is not None:
-            progress(len(segments))
+        segments, source = read[0], None
+    elif load is not None:
+        segments, source = _load(load / "segments", config, world), None
+        if (load / "segments").is_symlink():
+            source = (load / "segments").resolve()
+    else:
+        segments, source = _collect_or_find(config, world, env, seed=seed, progress=progress)
+    if load is not None and progress is not None:
+        progress(len(segments))
     memmap = None if config.memmap is None else Path(config.memmap)
     buffer = segment_buffer(segments, memmap=memmap)
-    if raters.label == "regret" and world.table is None:
-        groups = with_values(groups, segments, generator=stream(data_seed, "values"))
+    fitted = raters.label == "regret" and world.table is None
+    if fitted:
+        generator = stream(_data_seed(config, seed), "values")
+        groups = with_values(groups, segments, generator=generator)
     segment_utility = torch.stack([group.segment_utility(segments) for group in groups])
     names = tuple(group.name for group in groups)
     if read is not None:
         preferences = read[1]
-    elif load is None:
-        generator = stream(seed, "raters")
-        people = Raters.draw(
-            groups, num_raters=raters.count, shares=raters.shares, generator=generator
+    elif load is not None:
+        preferences = load_preferences(
+            load / "preferences",
+            num_segments=len(segments),
+            segments=segments_digest(load / "segments", segments),
         )
-        preferences = collect_preferences(
-            buffer,
-            people,
-            answers_per_rater=raters.answers,
-            generator=generator,
-            pool=training_pool(segments),
-        )[:].exclude("index")
+        # Fitted values depend on the seed, and differ between machines.
+        check_asked(load, preferences, names, None if fitted else segment_utility)
     else:
-        preferences = load_preferences(load / "preferences", num_segments=len(segments))
-        if GROUP in preferences.keys(True):
-            _check_groups(load, names, numbered=1 + int(preferences[GROUP].max()))
+        preferences = _ask(raters, groups, buffer, segments, seed=seed)
     return Data(buffer, preferences, segment_utility, source, names)
 
 
-def _check_groups(load: Path, names: tuple[str, ...], *, numbered: int) -> None:
-    """Raise unless preferences were given by the groups of these names, in this order.
+def _data_seed(config: DataConfig, seed: int) -> int:
+    """Seed of the segments."""
+    return seed if config.seed is None else config.seed
 
-    Groups are numbers in the preferences. Under other names each group would be measured by what
-    another one wants, and nothing would look wrong.
-    """
-    about = load / _ABOUT
-    try:
-        asked = json.loads(about.read_text(encoding="utf-8"))["groups"]
-        asked = [str(name) for name in asked]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(
-            f"{about} must say which groups the raters in {load} are of, and is not readable "
-            f"({type(error).__name__}: {error}); data of earlier versions have no such file. "
-            "Collect the data again, or, if raters.groups is what was asked then (see config.yaml "
-            f"of that run), write it yourself: {json.dumps({'groups': list(names)})}"
-        ) from error
-    if numbered > len(asked):
-        raise ValueError(
-            f"{load} holds preferences of {numbered} groups, but {about} names {len(asked)}; the "
-            "two do not belong together, collect the data again"
-        )
-    if asked == list(names):
-        return
-    what = "the same number of them in another order or by other names"
-    if len(asked) != len(names):
-        what = str(len(names))
-    raise ValueError(
-        f"{load} holds preferences of {len(asked)} groups, but raters.groups names {what}; name "
-        f"the groups that were asked then, in that order: expected [{', '.join(asked)}], got "
-        f"[{', '.join(names)}]"
-    )
+
+def _collect_or_find(
+    config: DataConfig,
+    world: World,
+    env: EnvConfig,
+    *,
+    seed: int,
+    progress: Callable[[int], None] | None,
+) -> tuple[TensorDictBase, Path | None]:
+    """Segments that are collected, or found in the store; and where they are in it."""
+    data_seed = _data_seed(config, seed)
+
+    def collect() -> TensorDictBase:
+        return _collect(config, world, env, stream(data_seed, "segments"), progress)
+
+    if config.store is None:
+        return collect(), None
+    about = describe(env, config, seed=data_seed)
+    name = "-".join([env.factory, *map(str, env.options.values())][:2])
+    folder = stored(store_path(Path(config.store), name, about), about, collect)
+    segments = _load(folder, config, world)
+    if progress is not None:
+        progress(len(segments))
+    return segments, folder
+
+
+def _ask(
+    raters: RatersConfig,
+    groups: tuple[RaterGroup, ...],
+    buffer: TensorDictReplayBuffer,
+    segments: TensorDictBase,
+    *,
+    seed: int,
+) -> TensorDict:
+    """What raters say of pairs of the segments."""
+    generator = stream(seed, "raters")
+    people = Raters.draw(groups, num_raters=raters.count, shares=raters.shares, generator=generator)
+    preferences: TensorDict = collect_preferences(
+        buffer,
+        people,
+        answers_per_rater=raters.answers,
+        generator=generator,
+        pool=training_pool(segments),
+    )[:].exclude("index")
+    return preferences
 
 
 def _read(
@@ -279,14 +309,19 @@ def _read(
     """Other people's segments and preferences, checked as ours are."""
     segments, preferences, *_ = reader(path)
     _check_segments(segments, path, config, world)
+    check_segments(segments, path)
     check_preferences(preferences, path, num_segments=len(segments))
     return segments, preferences
 
 
 def _load(path: Path, config: DataConfig, world: World) -> TensorDictBase:
-    segments = load_tensordict(path, required={OBSERVATION: 3, ACTION: 2, INFO: 0})
+    segments = load_segments(path, required={INFO: 0})
     _check_segments(segments, path.parent, config, world)
-    segments.auto_batch_size_(2)
+    if segments.shape[1] != config.length:
+        raise ValueError(
+            f"data.length is {config.length}, but {path.parent} holds segments of "
+            f"{segments.shape[1]} steps; set data.length={segments.shape[1]}, or collect others"
+        )
     return segments
 
 

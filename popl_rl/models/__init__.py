@@ -7,6 +7,7 @@
 * ``preference_likelihood``, ``calibration``: how likely answers are, and how firm scores are.
 * ``questions``: which pair to ask a person about next.
 * ``hypothesis_set``, ``policy_set``, ``encoded_policy_set``, ``reward_set``: the result of
-  training, catering to one person, one for all; ``sets`` makes and reads a set of any kind.
+  training, catering to one person, one for all; ``sets`` makes and reads a set of any kind, in
+  the form of ``set_files``.
 * ``schedules``: learning rates; ``text_features``: what reward functions read of texts.
 """

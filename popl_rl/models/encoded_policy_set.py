@@ -156,9 +156,15 @@ class _Encoded(HypothesisSet):
 
     @classmethod
     def _assemble(
-        cls, population: Population, path: Path, *, alpha: float, discount: float
+        cls,
+        population: Population,
+        path: Path,
+        *,
+        digest: str | None,
+        alpha: float,
+        discount: float,
     ) -> Self:
-        kept = load_tensordict(path / "encoder", required={"z": 2, "encoder": 0})
+        kept = load_tensordict(path / "encoder", required={"z": 2, "encoder": 0}, digest=digest)
         z = kept["z"]
         if len(z) != len(population):
             raise ValueError(f"there are {len(z)} z for {len(population)} members")

@@ -1,10 +1,10 @@
 """The result of training: a set of hypotheses, and choosing from it for one person or for all."""
 
-import json
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self, cast
+from typing import ClassVar, Literal, Self, cast
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
@@ -15,7 +15,7 @@ from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.data.pairs import draw_pairs, starts_of
 from popl_rl.keys import ANSWER, PAIR, Answer
-from popl_rl.models.policies import PolicySpec, build_network
+from popl_rl.models.policies import PolicySpec
 from popl_rl.models.population import Population
 from popl_rl.models.preference_likelihood import MISTAKE, log_likelihood
 from popl_rl.models.questions import (
@@ -28,8 +28,8 @@ from popl_rl.models.questions import (
 )
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.models.scoring import case_values, margins
+from popl_rl.models.set_files import VERSION, read_about, read_population, write_set
 from popl_rl.selection.lexicase import lexicase_selection
-from popl_rl.storage import load_tensordict, save_tensordict, written_beside
 
 __all__ = ["Catered", "HypothesisSet"]
 
@@ -59,6 +59,7 @@ class HypothesisSet:
         origin: Member of the trained population that each one is; empty if it is none of them.
         fair_member: The fair choice for the raters of the training, for people who have said
             nothing yet; None where nobody has made it.
+        provenance: Of a set that was read: what ``save`` was told of the run that it is from.
     """
 
     folder: ClassVar[str]  #: of a run, in which it is kept
@@ -73,6 +74,7 @@ class HypothesisSet:
         self.discount = discount
         self.origin = list(range(len(population)))
         self.fair_member: int | None = None
+        self.provenance: dict[str, str] = {}
 
     def distinct(self, bank: SegmentBank, comparisons: Comparisons) -> Self:
         """Keep one member for each distinct row of passes ``[M]``, the first with that row."""
@@ -274,16 +276,21 @@ class HypothesisSet:
         by_case = values.mean(1) if comparisons.is_single else values.quantile(quantile, dim=1)
         return int(by_case.argmax())
 
-    def save(self, path: Path | str) -> None:
+    def save(self, path: Path | str, *, provenance: Mapping[str, str] | None = None) -> None:
         """Write the set as tensors and JSON; nothing is left half-written.
+
+        Args:
+            path: The folder to be.
+            provenance: What is kept about the run that it is from, such as its id.
 
         Raises:
             FileExistsError: If ``path`` exists.
+            OSError: If there is no room.
         """
         population = self.population.plain()
         trunk = {name: value.tolist() for name, value in population.trunk.state_dict().items()}
         about = {
-            "format": f"popl_rl.{self._kind}_set/1",
+            "format": f"popl_rl.{self._kind}_set/{VERSION}",
             "members": len(self),
             "spec": asdict(cast("PolicySpec | RewardSpec", population.spec)),
             "evolve": population.evolve,
@@ -292,11 +299,9 @@ class HypothesisSet:
             "origin": self.origin,
             "fair_member": self.fair_member,
             "trunk": trunk,
+            "provenance": dict(provenance or {}),
         }
-        with written_beside(Path(path)) as beside:
-            save_tensordict(population.members.data, beside / "members")
-            self._write_more(beside)
-            (beside / f"{self._kind}_set.json").write_text(json.dumps(about))
+        write_set(Path(path), about, population.members.data, more=self._write_more)
 
     def _write_more(self, folder: Path) -> None:
         """Write what this kind of set keeps beside its members."""
@@ -307,6 +312,7 @@ class HypothesisSet:
         population: Population,
         path: Path,  # noqa: ARG003 - for kinds that keep more
         *,
+        digest: str | None,  # noqa: ARG003 - of what they keep
         alpha: float,
         discount: float,
     ) -> Self:
@@ -336,30 +342,17 @@ class HypothesisSet:
                 f"run{'; ' * bool(cure)}{cure}"
             )
         try:
-            about = json.loads(about_path.read_text())
-            if about["format"] != f"popl_rl.{cls._kind}_set/1":
-                raise ValueError(f"unknown format {about['format']!r}")
-            sizes: dict[str, Any] = {  # JSON knows no tuples
-                name: tuple(value) if isinstance(value, list) else value
-                for name, value in about["spec"].items()
-            }
-            spec = cls._spec(**sizes)
-            generator = torch.Generator().manual_seed(0)
-            networks = [build_network(spec, generator=generator) for _ in range(about["members"])]
-            population = Population(networks, spec, evolve=about["evolve"])
-            trunk = {name: torch.tensor(value) for name, value in about["trunk"].items()}
-            population.trunk.load_state_dict(trunk)
-            members = load_tensordict(path / "members")
-            expected = population.members.data
-            for key in expected.keys(True, True):
-                if members[key].shape != expected[key].shape:
-                    raise ValueError(f"{key} has shape {tuple(members[key].shape)}")
-            expected.update_(members)
+            about = read_about(about_path)
+            population = read_population(path, about, cls._spec)
             scale = {name: float(about[name]) for name in ("alpha", "discount")}
-            loaded = cls._assemble(population, path, **scale)
+            if not (0 < scale["alpha"] < math.inf and 0 < scale["discount"] <= 1):
+                raise ValueError(f"alpha must be positive and discount in (0, 1], got {scale}")
+            digest = about["digests"].get("encoder")
+            loaded = cls._assemble(population, path, digest=digest, **scale)
             loaded.origin = [int(member) for member in about["origin"]]
             fair = about.get("fair_member")  # sets of earlier versions do not know it
             loaded.fair_member = None if fair is None else int(fair)
+            loaded.provenance = dict(about.get("provenance", {}))
         except (
             AttributeError,
             FileNotFoundError,

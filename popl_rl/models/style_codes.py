@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from popl_rl.data.bank import SegmentBank
 from popl_rl.models.policies import PolicySpec, build_network
 from popl_rl.models.schedules import linear_decay
-from popl_rl.storage import load_tensordict, save_tensordict
+from popl_rl.storage import load_tensordict, read_manifest, save_tensordict
 
 __all__ = ["StyleClone", "load_clone", "save_clone", "train_clone"]
 
@@ -183,24 +183,41 @@ class _Encoder(nn.Module):
         return code.chunk(2, dim=-1)
 
 
-def save_clone(clone: StyleClone, path: Path) -> None:
+def save_clone(clone: StyleClone, path: Path, *, bank: str | None = None) -> None:
     """Write a clone as tensors; nothing is left half-written.
+
+    Args:
+        clone: The clone.
+        path: The folder to be.
+        bank: Digest of what it was trained on, which is kept.
 
     Raises:
         FileExistsError: If ``path`` exists.
     """
     state = dict(clone.network.state_dict())
-    save_tensordict(TensorDict({"codes": clone.codes, "network": TensorDict(state)}), path)
+    data = TensorDict({"codes": clone.codes, "network": TensorDict(state)})
+    save_tensordict(data, path, about={"bank": bank})
 
 
-def load_clone(spec: PolicySpec, path: Path) -> StyleClone:
+def load_clone(spec: PolicySpec, path: Path, *, bank: str | None = None) -> StyleClone:
     """Read what ``save_clone`` wrote.
+
+    Args:
+        spec: Sizes of the policies.
+        path: The folder.
+        bank: Digest of what it must have been trained on; None for whatever it was.
 
     Raises:
         FileNotFoundError: If there is none.
-        ValueError: If it is damaged or of other sizes.
+        ValueError: If it is damaged, of other sizes, or was trained on something else.
     """
     data = load_tensordict(path, required={"codes": 2})
+    manifest = read_manifest(path)
+    kept = None if manifest is None else manifest["about"].get("bank")
+    if None not in (kept, bank) and kept != bank:
+        raise ValueError(
+            f"{path} holds a style clone of other segments; remove it to train one anew"
+        )
     clone = StyleClone(spec, data["codes"])
     try:
         clone.network.load_state_dict(data["network"].to_dict())

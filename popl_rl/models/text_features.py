@@ -15,7 +15,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from popl_rl.storage import locked
+from popl_rl.locks import locked
 
 __all__ = ["FeatureCache", "language_model_features", "pool", "tfidf_features"]
 

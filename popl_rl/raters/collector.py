@@ -1,7 +1,5 @@
 """Preferences: which pairs are shown, to whom, and what they answer."""
 
-from pathlib import Path
-
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -10,12 +8,11 @@ from torchrl.envs import Transform
 
 from popl_rl.data.pairs import starts_of
 from popl_rl.data.segments import stored_segments
-from popl_rl.keys import ANSWER, GROUP, PAIR, RATER, UTILITY, Answer
+from popl_rl.keys import ANSWER, GROUP, PAIR, RATER, UTILITY
 from popl_rl.raters.pairs import PairPool
 from popl_rl.raters.people import Raters
-from popl_rl.storage import load_tensordict
 
-__all__ = ["PreferenceCollector", "check_preferences", "collect_preferences", "load_preferences"]
+__all__ = ["PreferenceCollector", "collect_preferences"]
 
 
 class PreferenceCollector(Transform):
@@ -124,44 +121,3 @@ def collect_preferences(
     )
     buffer.extend(TensorDict({RATER: rater}, [len(rater)]))
     return buffer
-
-
-def load_preferences(path: Path, *, num_segments: int) -> TensorDict:
-    """Read saved preferences and check that they belong to the segments at hand.
-
-    Raises:
-        FileNotFoundError: If there is no such folder.
-        ValueError: If it is damaged, foreign, or refers to segments that do not exist.
-    """
-    data = load_tensordict(path, required={PAIR: 2, ANSWER: 1, RATER: 1})
-    return check_preferences(data, path, num_segments=num_segments)
-
-
-def check_preferences(data: TensorDict, path: Path, *, num_segments: int) -> TensorDict:
-    """Check that preferences belong to the segments at hand.
-
-    Args:
-        data: TensorDict ``[M]`` with ``pair`` and ``answer``.
-        path: Where they are from, for the message.
-        num_segments: Number of segments N.
-
-    Returns:
-        The same preferences.
-
-    Raises:
-        ValueError: If they are damaged, foreign, or refer to segments that do not exist.
-    """
-    pair, answer = data[PAIR], data[ANSWER]
-    if pair.dtype != torch.int64 or pair.shape != (len(answer), 2) or not len(pair):
-        raise ValueError(
-            f"{path} must hold pairs of segment numbers, int64 of shape [M, 2], got {pair.dtype} "
-            f"of shape {list(pair.shape)} for {len(answer)} answers; it is damaged or foreign"
-        )
-    if pair.min() < 0 or pair.max() >= num_segments:
-        raise ValueError(
-            f"{path} compares segments {int(pair.min())}..{int(pair.max())}, but there are "
-            f"0..{num_segments - 1}; these preferences belong to other segments"
-        )
-    if answer.min() < 0 or answer.max() > max(Answer):
-        raise ValueError(f"{path} holds answers outside 0..{max(Answer)}; it is damaged or foreign")
-    return data

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from popl_rl import registry
 from popl_rl.data.behaviours import first_action
-from popl_rl.keys import ACTION, ANSWER, INFO, LEARNER_KEYS, OBSERVATION, PAIR, RATER, Answer
-from popl_rl.raters.collector import check_preferences
+from popl_rl.data.saved import check_preferences
+from popl_rl.keys import ACTION, ANSWER, INFO, LEARNER_KEYS, OBSERVATION, RATER, Answer
 from popl_rl.testing.plug_ins import Env, EnvReference, call, identical, made_env, name_of
 
 __all__ = ["check_reader"]
@@ -134,12 +134,6 @@ def _check_preferences(
         check_preferences(preferences, path, num_segments=num_segments)
     except ValueError as error:
         raise ValueError(f"reader {name!r}: {error}") from error
-    same = preferences[PAIR][:, 0] == preferences[PAIR][:, 1]
-    if bool(same.any()):
-        raise ValueError(
-            f"reader {name!r}: pairs must be two different segments, but {int(same.sum())} compare "
-            "a segment with itself; leave them out."
-        )
     if not bool((preferences[ANSWER] <= Answer.SECOND).any()):
         raise ValueError(
             f"reader {name!r}: preferences must hold a strict answer, 0 (first) or 1 (second), got "

@@ -15,7 +15,7 @@ from popl_rl.keys import ANSWER, PAIR, RATER
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.questions import Behaviours
 from popl_rl.raters.pairs import PairPool, training_pool
-from popl_rl.storage import save_tensordict, write_json
+from popl_rl.storage import read_manifest, save_tensordict, write_json
 from popl_rl.web.label_store import LabelStore
 
 __all__ = ["choose_pairs", "export", "kept_pairs"]
@@ -144,7 +144,9 @@ def export(store: LabelStore, folder: Path) -> int:
     target = folder / "preferences"
     aside = Path(tempfile.mkdtemp(prefix=".preferences.", dir=folder))
     try:
-        save_tensordict(data, aside / "new")
+        manifest = read_manifest(folder / "segments")
+        about = {} if manifest is None else {"segments": manifest["digest"]}
+        save_tensordict(data, aside / "new", about=about)
         if target.exists():
             target.rename(aside / "old")
         (aside / "new").rename(target)

@@ -17,11 +17,11 @@ import torch
 from tensordict import TensorDictBase
 
 from popl_rl.data.environments import World, offered
+from popl_rl.data.saved import load_segments
 from popl_rl.keys import ACTION, OBSERVATION
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.sets import load_set
 from popl_rl.randomness import stream
-from popl_rl.storage import load_tensordict
 from popl_rl.web.clips import Clip, Clips, film_strip, read_clip, write_clip
 
 __all__ = ["Scenes", "policy_clips", "segment_clips"]
@@ -137,8 +137,7 @@ def _records(scenes: Scenes) -> bool:
 def _render_segments(scenes: Scenes, wanted: list[int]) -> None:
     """Draw, or tell in words, some segments; runs in a process of its own."""
     torch.set_num_threads(1)
-    segments = load_tensordict(scenes.source / "segments")
-    segments.auto_batch_size_(2)
+    segments = load_segments(scenes.source / "segments")
     env = scenes.make_world().make_for_data()
     rate = float(env.metadata.get("render_fps", _RATE))
     record, render = offered(env, "record_segments"), offered(env, "render_segment")

@@ -379,3 +379,18 @@ def test_data_of_another_kind_are_refused(tmp_path, required):
     with pytest.raises(ValueError, match=r"data does not hold .* is missing; it has \["):
         load_tensordict(tmp_path / "data", required=required)
     assert load_tensordict(tmp_path / "data", required={"action": 2, "info": 0}) is not None
+
+
+def test_memory_mapped_segments_are_found_again_and_mended(segments, tmp_path):
+    segment_buffer(segments, memmap=tmp_path)
+    (file,) = tmp_path.glob("segments-*/action.memmap")
+    before = file.stat().st_ino
+    segment_buffer(segments, memmap=tmp_path)
+    assert file.stat().st_ino == before
+    damaged = bytearray(file.read_bytes())
+    damaged[3] ^= 1
+    file.write_bytes(damaged)
+    mended = stored_segments(segment_buffer(segments, memmap=tmp_path))
+    assert torch.equal(mended["action"], segments["action"])
+    segment_buffer(segments[:5], memmap=tmp_path)
+    assert len(list(tmp_path.glob("segments-*"))) == 2

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import pytest
 import torch
@@ -169,3 +170,31 @@ def test_names_of_fewer_groups_than_answered_are_refused(world, saved):
     (saved / "about.json").write_text('{"groups": ["likes_left"]}')
     with pytest.raises(ValueError, match=r"of 2 groups, but .*about\.json names 1; the two do not"):
         load(world, RATERS, saved)
+
+
+def test_names_that_were_exchanged_beside_the_answers_are_refused(world, saved):
+    (saved / "about.json").write_text('{"groups": ["likes_right", "likes_left"]}')
+    with pytest.raises(ValueError, match=r"but the raters in .* are of \[likes_left, "):
+        load(world, asking("likes_right", "likes_left"), saved)
+
+
+def test_a_rater_that_was_changed_since_is_not_judged_by_its_old_answers(world, saved, monkeypatch):
+    monkeypatch.setattr(
+        "popl_rl.testing.likes_left", lambda steps: torch.zeros(steps.shape), raising=False
+    )
+    with pytest.raises(ValueError, match="what likes_left want is not what they wanted"):
+        load(world, asking("likes_left", "likes_right"), saved)
+
+
+def test_segments_of_another_run_under_these_preferences_are_refused(world, groups, saved):
+    make_data(DATA, RATERS, world, groups, seed=1, env=ENV).save(saved / "other")
+    shutil.rmtree(saved / "segments")
+    (saved / "other" / "segments").rename(saved / "segments")
+    with pytest.raises(ValueError, match="compares other segments than those beside it"):
+        load(world, RATERS, saved)
+
+
+def test_data_of_another_length_are_refused(world, groups, saved):
+    longer = dataclasses.replace(DATA, length=DATA.length + 1)
+    with pytest.raises(ValueError, match=f"set data.length={DATA.length}, or collect others"):
+        make_data(longer, RATERS, world, groups, seed=0, env=ENV, load=saved)

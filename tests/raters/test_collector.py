@@ -6,9 +6,10 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from popl_rl.data.pairs import draw_pairs
+from popl_rl.data.saved import load_preferences, save_preferences
 from popl_rl.data.segments import segment_buffer
-from popl_rl.keys import ANSWER, GROUP, PAIR, RATER, UTILITY, Answer
-from popl_rl.raters.collector import PreferenceCollector, collect_preferences, load_preferences
+from popl_rl.keys import ANSWER, CHANCE, GROUP, PAIR, RATER, UTILITY, Answer
+from popl_rl.raters.collector import PreferenceCollector, collect_preferences
 from popl_rl.raters.groups import RaterGroup
 from popl_rl.raters.people import Raters
 from popl_rl.raters.response import Response
@@ -171,6 +172,22 @@ def negative_answers(data):
     data[ANSWER][3] = -1
 
 
+def a_pair_of_one_segment(data):
+    data[PAIR][5] = 3
+
+
+def a_rater_below_unknown(data):
+    data[RATER][2] = -5
+
+
+def a_negative_group(data):
+    data[GROUP][2] = -1
+
+
+def a_certain_chance(data):
+    data[CHANCE] = torch.full((len(data),), 1.5)
+
+
 def no_raters(data):
     del data[RATER]
 
@@ -188,6 +205,10 @@ def flat_pairs(data):
         (real_pairs, "must hold pairs of segment numbers, .* got torch.float32"),
         (unknown_answers, r"holds answers outside 0\.\.3; it is damaged or foreign"),
         (negative_answers, r"holds answers outside 0\.\.3"),
+        (a_pair_of_one_segment, "two different segments, but 1 compare a segment with itself"),
+        (a_rater_below_unknown, r"must hold rater as whole numbers, unknown \(-1\) or .* got -5"),
+        (a_negative_group, r"must hold hidden\.group as whole numbers, from 0, got -1"),
+        (a_certain_chance, "must hold chances from 0 to 1"),
         (no_raters, "does not hold what was expected: 'rater'"),
         (flat_pairs, "'pair' with at least 2 dimensions is missing"),
     ],
@@ -197,6 +218,13 @@ def test_foreign_preferences_are_refused(preferences, tmp_path, damage, message)
     save_tensordict(preferences, tmp_path / "data")
     with pytest.raises(ValueError, match=message):
         load_preferences(tmp_path / "data", num_segments=40)
+
+
+def test_preferences_of_other_segments_are_refused(preferences, tmp_path):
+    save_preferences(preferences, tmp_path / "data", segments="one")
+    load_preferences(tmp_path / "data", num_segments=40, segments="one")
+    with pytest.raises(ValueError, match="compares other segments than those beside it"):
+        load_preferences(tmp_path / "data", num_segments=40, segments="other")
 
 
 def test_no_preferences_at_all_are_refused(preferences, tmp_path):

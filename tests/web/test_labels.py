@@ -3,7 +3,7 @@ import json
 import pytest
 import torch
 
-from popl_rl.raters.collector import load_preferences
+from popl_rl.data.saved import load_preferences
 from popl_rl.raters.pairs import training_pool
 from popl_rl.storage import load_tensordict
 from popl_rl.web.label_store import LabelStore

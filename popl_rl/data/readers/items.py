@@ -12,8 +12,8 @@ from tensordict import TensorDict, TensorDictBase
 from popl_rl.data.readers.files import first_row, is_table, read_whole
 from popl_rl.data.readers.minari import minari_segments
 from popl_rl.data.readers.problems import Problems
+from popl_rl.data.saved import load_segments
 from popl_rl.keys import ACTION, MASK, OBSERVATION
-from popl_rl.storage import load_tensordict
 
 __all__ = ["Items", "features_as_segments", "read_features", "read_items", "read_segments"]
 
@@ -132,8 +132,7 @@ def read_segments(path: Path, *, length: int | None = None) -> Items:
     if any(path.glob("**/main_data.hdf5")):
         segments: TensorDictBase = minari_segments(path, length=length)
     else:
-        segments = load_tensordict(path, required={OBSERVATION: 3, ACTION: 2})
-        segments.auto_batch_size_(2)
+        segments = load_segments(path)
     return Items(segments, [str(row) for row in range(len(segments))])
 
 

@@ -9,6 +9,12 @@ import torch
 from tensordict import TensorDict
 
 from popl_rl.data.readers.imported import Imported, Names
+from popl_rl.data.saved import (
+    load_preferences,
+    load_segments,
+    save_preferences,
+    segments_digest,
+)
 from popl_rl.keys import (
     ACTION,
     ANSWER,
@@ -20,7 +26,7 @@ from popl_rl.keys import (
     RATER,
     REWARD,
 )
-from popl_rl.storage import load_tensordict, save_tensordict, written_beside
+from popl_rl.storage import save_tensordict, written_beside
 
 __all__ = ["read_folder", "write_csv", "write_folder", "write_npz"]
 
@@ -35,7 +41,8 @@ def write_folder(data: Imported, path: Path) -> None:
     """
     with written_beside(path) as beside:
         save_tensordict(data.segments, beside / "segments")
-        save_tensordict(data.preferences, beside / "preferences")
+        digest = segments_digest(beside / "segments", data.segments)
+        save_preferences(data.preferences, beside / "preferences", segments=digest)
         (beside / _NAMES).write_text(
             json.dumps(data.names._asdict(), ensure_ascii=False), encoding="utf-8"
         )
@@ -48,10 +55,13 @@ def read_folder(path: Path) -> Imported:
         FileNotFoundError: If there is no such folder.
         ValueError: If it is truncated, damaged, or something else.
     """
-    segments = load_tensordict(path / "segments", required={OBSERVATION: 3, ACTION: 2})
-    segments.auto_batch_size_(2)
-    preferences = load_tensordict(path / "preferences", required={PAIR: 2, ANSWER: 1})
-    preferences.auto_batch_size_(1)
+    segments = load_segments(path / "segments")
+    preferences = load_preferences(
+        path / "preferences",
+        num_segments=len(segments),
+        segments=segments_digest(path / "segments", segments),
+        named=False,
+    )
     names = Names()
     if (path / _NAMES).is_file():
         try:
