@@ -5,6 +5,7 @@ transitions are listed in a table, which gives exact advantages, behaviours and 
 """
 
 import itertools
+from collections.abc import Callable
 from typing import Any, Literal, TypeAlias
 
 import gymnasium
@@ -280,13 +281,24 @@ def lower(segments: TensorDictBase) -> Tensor:
     return _through(segments, 1)
 
 
-@rater("third")
+def _has_doors(count: int) -> Callable[[Any], str | None]:
+    """What speaks against raters who want a door that there may not be."""
+
+    def fits(env: Any) -> str | None:
+        doors = len(getattr(env, "door_cells", range(count)))
+        few = f"their door is one of {count} or more, and there are {doors}; set"
+        return None if doors >= count else f"{few} env.options.doors={count}"
+
+    return fits
+
+
+@rater("third", fits=_has_doors(3))
 def third(segments: TensorDictBase) -> Tensor:
     """Want the goal soon, through the second door from the top of three or four."""
     return _through(segments, 2)
 
 
-@rater("fourth")
+@rater("fourth", fits=_has_doors(4))
 def fourth(segments: TensorDictBase) -> Tensor:
     """Want the goal soon, through the third door from the top of four."""
     return _through(segments, 3)

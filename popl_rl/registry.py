@@ -25,6 +25,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal, TypeVar, get_args
 
+from popl_rl.plug_ins import described
+
 __all__ = [
     "Kind",
     "behaviour",
@@ -64,11 +66,13 @@ def env(name: str) -> Callable[[_T], _T]:
     return _decorator("env", name)
 
 
-def rater(name: str) -> Callable[[_T], _T]:
+def rater(name: str, *, fits: Callable[[Any], str | None] | None = None) -> Callable[[_T], _T]:
     """Register a rater group: segments ``[B, T]`` -> utility of each step ``[B, T]``.
 
     Args:
         name: What configurations call it.
+        fits: Asked with a run's environment (without its wrappers) before anything is done: what
+            speaks against these raters there, or None. It becomes the function's ``fits``.
 
     Raises:
         ValueError: When decorating, if another object has the name.
@@ -81,7 +85,14 @@ def rater(name: str) -> Callable[[_T], _T]:
         >>> resolve("rater", "tender") is tender
         True
     """
-    return _decorator("rater", name)
+    register = _decorator("rater", name)
+
+    def decorate(function: _T) -> _T:
+        if fits is not None:
+            setattr(function, "fits", fits)  # noqa: B010 - functions have no such attribute
+        return register(function)
+
+    return decorate
 
 
 def behaviour(name: str) -> Callable[[_T], _T]:
@@ -285,7 +296,7 @@ def _is_path(source: str) -> bool:
 def _import(kind: Kind, reference: str, name: str) -> ModuleType:
     try:
         return importlib.import_module(name)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         missing = isinstance(error, ModuleNotFoundError) and name.startswith(str(error.name))
         cure = (
             f" Is it installed, or did you mean the file '{name.replace('.', '/')}.py:...'?"
@@ -294,7 +305,7 @@ def _import(kind: Kind, reference: str, name: str) -> ModuleType:
         )
         raise ValueError(
             f"{kind} {reference!r}: importing module {name!r} failed with "
-            f"{type(error).__name__}: {error}.{cure} {_FORMS}"
+            f"{described(error)}.{cure} {_FORMS}"
         ) from error
 
 
@@ -321,10 +332,10 @@ def _load_file(kind: Kind, reference: str, source: str) -> ModuleType:
     sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         del sys.modules[name]
         raise ValueError(
-            f"{kind} {reference!r}: running {path} failed with {type(error).__name__}: {error}"
+            f"{kind} {reference!r}: running {path} failed with {described(error)}"
         ) from error
     return module
 

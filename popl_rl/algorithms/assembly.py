@@ -6,6 +6,7 @@ import torch
 
 from popl_rl.algorithms.cpl import pooled_population
 from popl_rl.algorithms.mixture_population import MixturePOPL
+from popl_rl.algorithms.plugged import checked_selection
 from popl_rl.algorithms.popl import POPL
 from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.rater_similarity import seed_with_specialists
@@ -42,7 +43,7 @@ def find_rule(reference: str, *, tournament: int) -> Selection | None:
     """
     if reference == "lexicase" or reference in SELECTIONS:
         return selection_rule(reference, tournament=tournament)
-    return cast("Selection", resolve("selection", reference))
+    return checked_selection(resolve("selection", reference), reference)
 
 
 def build_popl(

@@ -11,11 +11,10 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
-import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -25,12 +24,20 @@ from popl_rl.data.behaviours import (
     random_behaviour,
     table_behaviour,
 )
+from popl_rl.data.plugged import (
+    CheckedEnv,
+    Collect,
+    checked_behaviour,
+    checked_behaviours,
+    checked_collect,
+    checked_table,
+)
 from popl_rl.data.tables import Table
 from popl_rl.keys import ACTION
+from popl_rl.plug_ins import defined, failure, is_foreign
 from popl_rl.registry import resolve
 
 __all__ = [
-    "Collect",
     "World",
     "behaviour_shares",
     "counting_from_zero",
@@ -41,21 +48,6 @@ __all__ = [
 ]
 
 MakeEnv = Callable[[], gymnasium.Env[Any, Any]]
-
-
-class Collect(Protocol):
-    """An environment's own way to collect segments."""
-
-    def __call__(
-        self,
-        num_segments: int,
-        length: int,
-        *,
-        generator: torch.Generator,
-        progress: Callable[[int], None] | None = None,
-    ) -> TensorDictBase:
-        """Segments ``[num_segments, length]``; ``progress`` is told how many there are so far."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -106,8 +98,8 @@ def make_world(
         mixture: Shares of the behaviours, see ``behaviour_shares``.
 
     Raises:
-        ValueError: If the environment cannot be resolved or built, or ``mixture`` names behaviours
-            that it does not have.
+        ValueError: If the environment cannot be resolved or built, what it offers makes no sense,
+            or ``mixture`` names behaviours that it does not have.
         TypeError: If it has no behaviours and its actions cannot be drawn at random, see
             ``popl_rl.data.behaviours.random_behaviour``.
     """
@@ -123,12 +115,17 @@ def make_world(
         except (TypeError, gymnasium.error.Error) as error:
             raise ValueError(
                 f"env.factory {factory!r} cannot be built with id {env_id!r} and options "
-                f"{options}: {error}"
+                f"{options}: {error} ({defined(make_env)})"
             ) from error
+        except (Exception, SystemExit) as error:
+            if not is_foreign(make_env):
+                raise  # ours say in their own words which option is off
+            raise failure("env", factory, "making it", error, make_env) from error
         if not isinstance(env, gymnasium.Env):
             raise ValueError(
                 f"env.factory {factory!r} must return a gymnasium.Env, got {type(env)}"
             )
+        env = CheckedEnv(env, factory if env_id is None else env_id)
         if isinstance(env.action_space, gymnasium.spaces.Box):
             # A Gaussian policy's mean knows no bounds. Gymnasium's own ClipAction would hide the
             # bounds, which random actions need.
@@ -143,18 +140,19 @@ def make_world(
         return build({**(options or {}), **(data_options or {})})
 
     env = make()
-    list_table, list_behaviours = offered(env, "transition_table"), offered(env, "behaviours")
-    table = None if list_table is None else list_table()
-    first = first_action(env.action_space)
-    given = {} if list_behaviours is None else list_behaviours()
+    space, first = env.action_space, first_action(env.action_space)
+    table = checked_table(offered(env, "transition_table"), factory)
+    given = checked_behaviours(offered(env, "behaviours"), factory)
     behaviours = {
-        name: table_behaviour(what, first=first) if isinstance(what, Tensor) else what
+        name: table_behaviour(what, first=first)
+        if isinstance(what, Tensor)
+        else checked_behaviour(what, factory, name, space)
         for name, what in given.items()
-    } or {"random": random_behaviour(env.action_space)}
+    } or {"random": random_behaviour(space)}
     shares = behaviour_shares(list(behaviours), mixture)
     collect = None
     if offered(env, "collect_segments") is not None:
-        collect = offered(make_for_data(), "collect_segments")
+        collect = checked_collect(offered(make_for_data(), "collect_segments"), factory)
     return World(make, make_for_data, env, behaviours, shares, table, collect)
 
 

@@ -3,13 +3,14 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import gymnasium
 import torch
 from tensordict import TensorDict, TensorDictBase
 
 from popl_rl.algorithms.cpl import GroupCPL, group_weights, train
+from popl_rl.algorithms.plugged import checked_method
 from popl_rl.algorithms.problem import Method, Problem
 from popl_rl.config import EvaluationConfig, MethodConfig, plain
 from popl_rl.data.bank import SegmentBank
@@ -23,6 +24,7 @@ from popl_rl.models.policies import PolicySpec
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.models.sets import load_set
 from popl_rl.models.style_codes import StyleClone, load_clone, save_clone, train_clone
+from popl_rl.plug_ins import defined, failure, is_foreign
 from popl_rl.randomness import stream
 from popl_rl.registry import resolve
 
@@ -161,9 +163,13 @@ def build_method(
     except TypeError as error:
         raise TypeError(
             f"method {config.name!r}: {config.factory} was called with problem, generator and "
-            f"{sorted([*sections, *config.options])}, and failed: {error}"
+            f"{sorted([*sections, *config.options])}, and failed: {error} ({defined(factory)})"
         ) from error
-    return cast("Method", method)
+    except (Exception, SystemExit) as error:
+        if not is_foreign(factory):
+            raise
+        raise failure("method", config.name, "building it", error, factory) from error
+    return checked_method(method, config.name)
 
 
 def train_baselines(

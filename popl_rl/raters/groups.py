@@ -14,6 +14,7 @@ from torch import Tensor
 from popl_rl import registry
 from popl_rl.data import tables as planning
 from popl_rl.keys import ACTION, INFO, OBSERVATION
+from popl_rl.plug_ins import call, located
 from popl_rl.raters.checks import checked
 from popl_rl.raters.response import Response
 
@@ -75,14 +76,10 @@ class RaterGroup:
             TypeError: If the rater's function returns no floating-point tensor.
             ValueError: If it fails, or its result has another shape or is not finite.
         """
-        try:
-            result = self.utility(segments)
-        except Exception as error:
-            raise ValueError(
-                f"rater {self.name!r} failed on segments of batch size "
-                f"{list(segments.batch_size)} with {type(error).__name__}: {error}"
-            ) from error
-        return checked(result, segments, rater=self.name)
+        doing = f"judging segments of batch size {list(segments.batch_size)}"
+        result = call("rater", self.name, doing, self.utility, segments)
+        with located(self.utility):
+            return checked(result, segments, rater=self.name)
 
     def perceived_utility(self, segments: TensorDictBase) -> Tensor:
         """Return the worth of each step by which this group compares, float ``[N, T]``.

@@ -9,7 +9,6 @@ import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 from torchrl import logger
 from torchrl.envs import GymWrapper
 from torchrl.envs.utils import check_env_specs
@@ -18,11 +17,11 @@ from popl_rl.data.behaviours import first_action
 from popl_rl.data.environments import counting_from_zero
 from popl_rl.data.tables import Table
 from popl_rl.keys import ACTION, INFO, OBSERVATION, REWARD
-from popl_rl.testing.plug_ins import Env, call
+from popl_rl.plug_ins import call
+from popl_rl.testing.plug_ins import Env
 
 __all__ = [
     "Step",
-    "check_behaviours",
     "check_repeats",
     "check_spaces",
     "check_table",
@@ -239,29 +238,6 @@ def _disagree(name: str, what: str) -> None:
         f"env {name!r}: transition_table() must agree with stepping, but {what}; build both from "
         "one function."
     )
-
-
-def check_behaviours(name: str, found: Any) -> None:
-    """Check that behaviours are functions or tables of probabilities."""
-    if not isinstance(found, dict) or not found:
-        raise TypeError(
-            f"env {name!r}: behaviours() must return a dict of at least one name, got "
-            f"{found if found == {} else type(found).__name__}."
-        )
-    for label, policy in found.items():
-        if callable(policy):
-            continue
-        if not isinstance(policy, Tensor) or not policy.is_floating_point() or policy.ndim != 2:
-            raise TypeError(
-                f"env {name!r}: behaviour {label!r} must be a float tensor [states, actions] or a "
-                f"function, got {getattr(policy, 'dtype', type(policy).__name__)}."
-            )
-        total = policy.sum(1)
-        if not bool((policy >= 0).all()) or not torch.allclose(total, torch.ones_like(total)):
-            raise ValueError(
-                f"env {name!r}: each row of behaviour {label!r} must be probabilities that sum to "
-                "1; use softmax(-1)."
-            )
 
 
 def check_torchrl(name: str, env: Env) -> None:

@@ -3,15 +3,16 @@
 from typing import Any
 
 from popl_rl.data.environments import offered
+from popl_rl.data.plugged import check_behaviours
+from popl_rl.plug_ins import call
 from popl_rl.testing.env_parts import (
-    check_behaviours,
     check_repeats,
     check_spaces,
     check_table,
     check_torchrl,
     random_steps,
 )
-from popl_rl.testing.plug_ins import EnvReference, call, made_env, name_of
+from popl_rl.testing.plug_ins import EnvReference, made_env, name_of
 
 __all__ = ["check_env"]
 

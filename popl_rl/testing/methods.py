@@ -25,7 +25,8 @@ from popl_rl.config import (
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.population import Population
 from popl_rl.models.sets import load_set
-from popl_rl.testing.plug_ins import call, name_of
+from popl_rl.plug_ins import call
+from popl_rl.testing.plug_ins import name_of
 from popl_rl.testing.tiny_problem import poisoned, tiny_data, tiny_problem
 
 __all__ = ["check_method"]

@@ -12,11 +12,11 @@ from popl_rl import registry
 from popl_rl.data.behaviours import random_behaviour
 from popl_rl.data.rollouts import MASK, lockstep
 from popl_rl.data.segments import cut_segments
+from popl_rl.plug_ins import call
 
 __all__ = [
     "Env",
     "EnvReference",
-    "call",
     "identical",
     "made_env",
     "name_of",
@@ -25,26 +25,6 @@ __all__ = [
 
 Env: TypeAlias = gymnasium.Env[Any, Any]
 EnvReference: TypeAlias = str | Env | Callable[..., Env]
-
-
-def call(
-    kind: str, name: str, doing: str, function: Callable[..., Any], *args: Any, **kwargs: Any
-) -> Any:
-    """Call what the author wrote; what that raises becomes the cause of a ValueError.
-
-    Args:
-        kind: Kind of the plug-in, such as ``"env"``.
-        name: What messages call it.
-        doing: What is being done, such as ``"reset"``.
-        function: What is called, with the arguments that follow.
-        *args: Its arguments.
-        **kwargs: Its keyword arguments.
-    """
-    try:
-        return function(*args, **kwargs)
-    except Exception as error:
-        message = f"{kind} {name!r}: {doing} failed with {type(error).__name__}: {error}"
-        raise ValueError(message) from error
 
 
 def name_of(thing: Any) -> str:

@@ -13,7 +13,8 @@ from popl_rl import registry
 from popl_rl.data.behaviours import first_action
 from popl_rl.data.saved import check_preferences
 from popl_rl.keys import ACTION, ANSWER, INFO, LEARNER_KEYS, OBSERVATION, RATER, Answer
-from popl_rl.testing.plug_ins import Env, EnvReference, call, identical, made_env, name_of
+from popl_rl.plug_ins import call
+from popl_rl.testing.plug_ins import Env, EnvReference, identical, made_env, name_of
 
 __all__ = ["check_reader"]
 

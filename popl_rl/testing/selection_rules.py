@@ -7,9 +7,10 @@ import torch
 from torch import Tensor
 
 from popl_rl import registry
+from popl_rl.plug_ins import call
 from popl_rl.selection.lexicase import lexicase_selection
 from popl_rl.selection.rules import SELECTIONS, Selection
-from popl_rl.testing.plug_ins import call, name_of
+from popl_rl.testing.plug_ins import name_of
 
 __all__ = ["check_selection"]
 

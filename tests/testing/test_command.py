@@ -18,7 +18,7 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     assert main(["rater", "mine.py:rude"]) == 2
     faults = capsys.readouterr()
     assert faults.out == ""
-    assert faults.err.startswith("rater 'rude' failed on segments")
+    assert faults.err.startswith("rater 'rude': judging segments")
     assert faults.err.count("\n") == 1
     assert main(["env", "two_door"]) == 2
     assert "Did you mean 'two_doors'?" in capsys.readouterr().err

@@ -131,6 +131,7 @@ class Spy(Good):
 
     def step(self):
         said = super().step()
+        gc.collect()  # what earlier tests have left in circles is no finding
         data = [thing for thing in gc.get_objects() if type(thing) is TensorDict]
         groups = [thing["hidden", "group"] for thing in data if "hidden" in thing.keys()]  # noqa: SIM118
         return {**said, "groups": float(any((group < 0).any() for group in groups))}

@@ -5,8 +5,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
+from tensordict import TensorDictBase
+
+from popl_rl.data.plugged import check_segments
 from popl_rl.data.readers.files import is_table, read_pieces
 from popl_rl.data.readers.imported import Imported
+from popl_rl.keys import LEARNER_KEYS
+from popl_rl.plug_ins import call, is_foreign, located
 from popl_rl.registry import names, resolve
 
 __all__ = ["guess_reader", "open_data"]
@@ -71,5 +76,29 @@ def open_data(
         )
     if progress is not None and "progress" in known:
         given["progress"] = progress
-    found = read(path, **given)
-    return found if isinstance(found, Imported) else Imported(*found)
+    if not is_foreign(read):
+        found = read(path, **given)
+        return found if isinstance(found, Imported) else Imported(*found)
+    found = call("reader", chosen, f"reading {path}", read, path, **given)
+    with located(read):
+        return _checked(found, chosen)
+
+
+def _checked(found: Any, reader: str) -> Imported:
+    """What a reader of other people's returned."""
+    if not isinstance(found, tuple) or not 2 <= len(found) <= 3:
+        got = f"{len(found)} values" if isinstance(found, tuple) else f"a {type(found).__name__}"
+        raise TypeError(f"reader {reader!r} must return (segments, preferences), got {got}")
+    read = Imported(*found)
+    check_segments(read.segments, f"reader {reader!r}: segments")
+    preferences = read.preferences
+    if not isinstance(preferences, TensorDictBase) or len(preferences.batch_size) != 1:
+        got = getattr(preferences, "batch_size", type(preferences).__name__)
+        raise TypeError(f"reader {reader!r}: preferences must be a TensorDict [M], got {got}")
+    missing = [key for key in LEARNER_KEYS if key not in preferences.keys()]  # noqa: SIM118
+    if missing:
+        raise ValueError(
+            f"reader {reader!r}: preferences must hold {', '.join(map(str, LEARNER_KEYS))}, but "
+            f"have no {', '.join(map(str, missing))}"
+        )
+    return read
