@@ -22,6 +22,7 @@ from torch import Tensor
 from popl_rl.data.tables import Table, solve
 from popl_rl.envs.explorer import Explorer
 from popl_rl.keys import ACTION, INFO, OBSERVATION, REWARD
+from popl_rl.raters.groups import Utility
 from popl_rl.registry import env, rater
 
 __all__ = ["TwoDoors", "fourth", "lower", "third", "two_doors", "upper"]
@@ -281,24 +282,30 @@ def lower(segments: TensorDictBase) -> Tensor:
     return _through(segments, 1)
 
 
-def _has_doors(count: int) -> Callable[[Any], str | None]:
-    """What speaks against raters who want a door that there may not be."""
+def _needs_doors(count: int) -> Callable[[Utility], Utility]:
+    """Let a rater say, before anything is done, that an environment lacks the door it wants."""
 
     def fits(env: Any) -> str | None:
         doors = len(getattr(env, "door_cells", range(count)))
         few = f"their door is one of {count} or more, and there are {doors}; set"
         return None if doors >= count else f"{few} env.options.doors={count}"
 
-    return fits
+    def mark(function: Utility) -> Utility:
+        setattr(function, "fits", fits)  # noqa: B010 - the type of a function has none
+        return function
+
+    return mark
 
 
-@rater("third", fits=_has_doors(3))
+@rater("third")
+@_needs_doors(3)
 def third(segments: TensorDictBase) -> Tensor:
     """Want the goal soon, through the second door from the top of three or four."""
     return _through(segments, 2)
 
 
-@rater("fourth", fits=_has_doors(4))
+@rater("fourth")
+@_needs_doors(4)
 def fourth(segments: TensorDictBase) -> Tensor:
     """Want the goal soon, through the third door from the top of four."""
     return _through(segments, 3)

@@ -66,13 +66,11 @@ def env(name: str) -> Callable[[_T], _T]:
     return _decorator("env", name)
 
 
-def rater(name: str, *, fits: Callable[[Any], str | None] | None = None) -> Callable[[_T], _T]:
+def rater(name: str) -> Callable[[_T], _T]:
     """Register a rater group: segments ``[B, T]`` -> utility of each step ``[B, T]``.
 
     Args:
         name: What configurations call it.
-        fits: Asked with a run's environment (without its wrappers) before anything is done: what
-            speaks against these raters there, or None. It becomes the function's ``fits``.
 
     Raises:
         ValueError: When decorating, if another object has the name.
@@ -85,14 +83,7 @@ def rater(name: str, *, fits: Callable[[Any], str | None] | None = None) -> Call
         >>> resolve("rater", "tender") is tender
         True
     """
-    register = _decorator("rater", name)
-
-    def decorate(function: _T) -> _T:
-        if fits is not None:
-            setattr(function, "fits", fits)  # noqa: B010 - functions have no such attribute
-        return register(function)
-
-    return decorate
+    return _decorator("rater", name)
 
 
 def behaviour(name: str) -> Callable[[_T], _T]:

@@ -11,5 +11,6 @@ Nothing here imports raters: a learner cannot see who voted.
 held-out raters need; ``stacked_adam``: an optimiser for a population that grows and shrinks.
 ``multi_cpl``: CPL ensembles; ``cpl``: pooled CPL and the oracle; ``em``: EM mixtures; ``vpl``: a
 latent variable; ``brex``, ``dpl``, ``reward_baselines``: reward learners that know no groups.
-``trainer``: any method as a TorchRL Trainer with checkpoints.
+``trainer``: any method as a TorchRL Trainer with checkpoints; ``plugged``: methods and selection
+rules of other people, checked wherever they are called.
 """

@@ -1,6 +1,7 @@
 """Behaviour to be compared: environments, episodes, segments, and the comparisons of segments.
 
-* ``environments``: environments built from settings; ``tables``: their transitions, solved exactly.
+* ``environments``: environments built from settings; ``tables``: their transitions, solved exactly;
+  ``plugged``: environments of other people and what they offer, checked wherever they are called.
 * ``behaviours``: who acts while data are collected; ``rollouts``: whole episodes in lockstep.
 * ``segments``: episodes cut into segments; ``store``: segments that several runs share;
   ``saved``: segments and preferences in a folder, checked whenever they are read.

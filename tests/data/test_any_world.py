@@ -5,6 +5,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 from popl_rl import registry
 from popl_rl.data.environments import make_world, offered
@@ -38,7 +39,9 @@ class Guided(gymnasium.Wrapper):
         return {"ones": lambda step, generator: torch.ones(step.batch_size, dtype=torch.long)}
 
     def collect_segments(self, num_segments, length, *, generator, progress=None):
-        return "collected by the wrapper"
+        shape = (num_segments, length)
+        steps = {"observation": torch.full((*shape, 1), 7.0), "action": torch.zeros(shape).long()}
+        return TensorDict(steps, shape)
 
 
 def guided():
@@ -96,7 +99,8 @@ def test_what_a_wrapper_offers_is_used():
         world = make_world("guided")
     assert list(world.behaviours) == ["ones"]
     assert world.collect is not None
-    assert world.collect(1, 1, generator=torch.Generator()) == "collected by the wrapper"
+    collected = world.collect(2, 3, generator=torch.Generator())
+    assert collected["observation"].unique().tolist() == [7]
     assert offered(world.env, "transition_table") is None
 
 

@@ -232,11 +232,7 @@ def test_a_label_and_advantages_go_together():
 @pytest.mark.parametrize(
     ("function", "error", "message"),
     [
-        (
-            lambda s: s["speed"],
-            ValueError,
-            "segments of batch size .* failed with KeyError",
-        ),
+        (lambda s: s["speed"], ValueError, "batch size .* failed with KeyError"),
         (lambda s: s["reward"].numpy(), TypeError, "must return a float tensor.*got a ndarray"),
         (lambda s: s["reward"].sum(1), ValueError, r"\[3, 3\], got shape \[3\]; give each step"),
         (lambda s: s["observation"], ValueError, r"got shape \[3, 3, 1\]; reduce the last"),
