@@ -65,7 +65,7 @@ def checked_method(method: Any, name: str) -> Method:
         return cast("Method", method)
     with located(type(method)):
         _check_protocol(method, name)
-    return _CheckedMethod(method, name)
+    return cast("Method", _CheckedMethod(method, name))
 
 
 def _check_protocol(method: Any, name: str) -> None:
