@@ -44,7 +44,7 @@ def run(config: Config) -> Result:
     # Imported late, so that a wrong setting is told at once.
     from popl_rl.experiments import people_steps, steps
 
-    config, run_dir = steps.open_run(config, command=sys.argv, given=given_overrides())
+    config, run_dir, _ = steps.open_run(config, command=sys.argv, given=given_overrides())
     people = people_steps.read_people(config, run_dir)
     told = ["oracle"] if any(people.groups) and config.method.ties == "drop" else []
     methods = [*people_steps.REFERENCES, *told, *config.people.methods]

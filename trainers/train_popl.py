@@ -43,19 +43,21 @@ class Result:
 def run(config: Config) -> Result:
     """Train, or go on where a killed run was stopped."""
     config = prepare(config)
+    is_new = config.resume is None
     # Imported late, so that a wrong setting is told at once.
     from popl_rl.experiments import steps
 
-    config, run_dir = steps.open_run(config, command=sys.argv, given=given_overrides())
-    if not config.raters.groups:
+    config, run_dir, place = steps.open_run(config, command=sys.argv, given=given_overrides())
+    if place is None:
         return _run_people(config, run_dir)
 
-    # 1. World, raters, and what they say.
-    setting = steps.gather(config, run_dir)
+    # 1. World, raters, and what they say; the population to start from.
+    with steps.kept_unless_refused(run_dir, is_new=is_new):
+        setting = steps.gather(config, run_dir, place)
+        method = steps.build(config, setting)
 
     # 2. The population, evolved.
     with steps.open_logger(config, run_dir) as logger:
-        method = steps.build(config, setting)
         found = steps.evolve(config, setting, method, run_dir, logger)
 
         # 3. What the set is compared with, on the same data and by the same recipe.

@@ -125,7 +125,12 @@ def _with_last_step_repeated(episodes: TensorDictBase) -> TensorDictBase:
 
 
 def info_rates(episodes: TensorDictBase, key: str) -> dict[int, Tensor]:
-    """Share of episodes in which an integer info ever took each value, ``value -> [P]``."""
+    """Share of episodes in which an integer info ever took each value, ``value -> [P]``.
+
+    Empty without that key.
+    """
+    if (INFO, key) not in episodes.keys(include_nested=True):
+        return {}
     value, mask = episodes[INFO, key], episodes[MASK]
     seen = value[mask].unique().tolist()
     return {int(v): ((value == v) & mask).any(-1).float().mean(-1) for v in seen}
@@ -154,7 +159,13 @@ def steps_to_success(episodes: TensorDictBase, key: str) -> Tensor:
 
 
 def mean_and_peak(episodes: TensorDictBase, key: str) -> tuple[Tensor, Tensor]:
-    """Mean and greatest value of an info in an episode, each averaged over episodes, ``[P]``."""
+    """Mean and greatest value of an info in an episode, each averaged over episodes, ``[P]``.
+
+    NaN without that key.
+    """
+    if (INFO, key) not in episodes.keys(include_nested=True):
+        unknown = torch.full(episodes.shape[:1], float("nan"))
+        return unknown, unknown
     value, mask = episodes[INFO, key].float(), episodes[MASK]
     mean = (value * mask).sum(-1) / mask.sum(-1)
     peak = value.masked_fill(~mask, -torch.inf).amax(-1)

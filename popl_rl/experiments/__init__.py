@@ -6,7 +6,8 @@
 - A run's folder: ``run_folder``, ``metrics``, ``loggers``, and its ``report``.
 - A benchmark: ``suites`` reads what is compared, ``cells`` plans it and collects what came out,
   ``jobs`` runs it in processes, ``benchmark_tables`` and ``benchmark_report`` tell the results.
-- ``steps``: the steps of a training run, in their order; ``reevaluation`` of a finished one.
+- ``steps``: the steps of a training run, in their order; ``preflight``: what is looked at before it
+  has a folder; ``reevaluation`` of a finished one.
 - Real people: ``encoding`` of their texts, ``people`` who are held out, ``people_training``,
   ``people_steps`` of a run and its ``people_report``; ``delivery_study`` and ``argument_study``.
 - ``markdown`` lays out the tables of all reports, ``tables`` those of the README files.

@@ -33,6 +33,7 @@ __all__ = [
     "build_method",
     "build_problem",
     "build_spec",
+    "check_baselines",
     "train_baselines",
 ]
 
@@ -213,13 +214,30 @@ def train_baselines(
 
 def _load_baselines(path: str, problem: Problem, num_groups: int) -> HypothesisSet:
     loaded = load_set(path)
+    check_baselines(loaded, path, problem.spec, num_groups)
+    loaded.population.to(problem.device)
+    return loaded
+
+
+def check_baselines(
+    loaded: HypothesisSet, path: str, spec: PolicySpec | RewardSpec, num_groups: int
+) -> None:
+    """Raise unless baselines of another run can be those of this one.
+
+    Args:
+        loaded: The baselines.
+        path: Where they are from, for the message.
+        spec: Sizes of the hypotheses.
+        num_groups: Number of groups G.
+
+    Raises:
+        ValueError: If they are not ``1 + G``, or act or judge in another world.
+    """
     own = loaded.population.spec
     # Other hidden layers do: baselines need not be built as the members are.
-    kinds = [(type(s), s.observation_dim, s.action_dim, s.discrete) for s in (own, problem.spec)]
+    kinds = [(type(s), s.observation_dim, s.action_dim, s.discrete) for s in (own, spec)]
     if len(loaded) != 1 + num_groups or kinds[0] != kinds[1]:
         raise ValueError(
             f"evaluation.baselines_from: {path} holds {len(loaded)} of {own}, expected "
-            f"{1 + num_groups} of {problem.spec}; name a run on the same data"
+            f"{1 + num_groups} of {spec}; name a run on the same data"
         )
-    loaded.population.to(problem.device)
-    return loaded

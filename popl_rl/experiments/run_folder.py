@@ -5,13 +5,14 @@ continues a killed run, never finds half a file. Rows of ``metrics.csv`` are the
 are appended, and a torn last one is dropped when the file is opened again.
 """
 
+import errno
 import importlib.metadata
 import json
 import platform
 import re
 import shlex
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ import torch
 from omegaconf import OmegaConf
 
 from popl_rl.experiments.loggers import Progress, RunLogger, make_logger
-from popl_rl.storage import write_atomic, write_json
+from popl_rl.storage import write_atomic, write_json, written_beside
 
 __all__ = [
     "Progress",
@@ -45,13 +46,22 @@ _PACKAGES = (
 )
 
 
-def create_run_dir(path: Path | None, *, name: str, resume: bool = False) -> Path:
+def create_run_dir(
+    path: Path | None,
+    *,
+    name: str,
+    resume: bool = False,
+    fill: Callable[[Path], None] = lambda _: None,
+) -> Path:
     """Make the folder of a run, or find the one to continue.
+
+    A new folder appears with its first content.
 
     Args:
         path: The folder; None for ``runs/<date-time>-<name>`` under the current folder.
         name: Names the run where ``path`` is None; characters unfit for a folder become ``-``.
         resume: Continue the run in ``path`` instead of starting one.
+        fill: Writes the first content of a new folder.
 
     Returns:
         The folder, which exists.
@@ -76,8 +86,11 @@ def create_run_dir(path: Path | None, *, name: str, resume: bool = False) -> Pat
         # Runs of one sweep can start within the same second.
         for folder in [base, *(base.with_name(f"{base.name}-{i}") for i in range(2, 1000))]:
             try:
-                folder.mkdir(parents=True)
-            except FileExistsError:
+                with written_beside(folder) as beside:
+                    fill(beside)
+            except OSError as error:
+                if error.errno not in (errno.EEXIST, errno.ENOTEMPTY) and not folder.exists():
+                    raise
                 continue
             return folder
         raise FileExistsError(f"{base} and 998 folders like it exist; choose run_dir=<dir>")
@@ -86,7 +99,11 @@ def create_run_dir(path: Path | None, *, name: str, resume: bool = False) -> Pat
             f"run_dir {path} exists and is not empty; choose another run_dir, or continue that run "
             f"with resume={path}"
         )
-    path.mkdir(parents=True, exist_ok=True)
+    if path.exists():  # empty, and perhaps a disk of its own
+        fill(path)
+    else:
+        with written_beside(path) as beside:
+            fill(beside)
     return path
 
 

@@ -2,8 +2,8 @@
 
 import logging
 import shutil
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -27,23 +27,24 @@ from popl_rl.experiments.builders import (
     build_spec,
     train_baselines,
 )
-from popl_rl.experiments.data import Data, build_groups, build_world, given_data, make_data
+from popl_rl.experiments.data import Data, given_data, make_data
 from popl_rl.experiments.evaluators import make_evaluator
 from popl_rl.experiments.loggers import Progress, RunLogger, make_logger
 from popl_rl.experiments.metrics import MetricsWriter
+from popl_rl.experiments.preflight import Place, check_infos, survey
 from popl_rl.experiments.report import markdown
 from popl_rl.experiments.run_folder import (
     create_run_dir,
     save_config,
     write_metadata,
 )
+from popl_rl.keys import INFO
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.models.sets import as_set
 from popl_rl.models.style_population import StyledPopulation
 from popl_rl.randomness import stream
 from popl_rl.raters.groups import RaterGroup
-from popl_rl.registry import resolve
 from popl_rl.storage import write_atomic
 
 __all__ = [
@@ -54,6 +55,7 @@ __all__ = [
     "evaluate",
     "evolve",
     "gather",
+    "kept_unless_refused",
     "log_results",
     "open_logger",
     "open_run",
@@ -97,7 +99,7 @@ class References:
 
 def open_run(
     config: Config, *, command: Sequence[str], given: Sequence[str] = ()
-) -> tuple[Config, Path]:
+) -> tuple[Config, Path, Place | None]:
     """Make the folder of a run, or find the one to continue with its own settings.
 
     Args:
@@ -106,11 +108,16 @@ def open_run(
         given: Overrides that were typed; of those beside ``resume=`` a run that is continued takes
             the ones that ``popl_rl.config.CHANGEABLE`` allows.
 
+    Returns:
+        The settings, the folder, and where the run takes place; no place where people's answers are
+        learnt from without simulated raters.
+
     Raises:
-        ValueError: If the settings of the run that is continued are off, or those of a new one name
-            an environment, rater, method or reader that there is not.
+        ValueError: If the settings of the run that is continued are off, or something that they
+            name cannot be found or does not go together.
         OSError: If the folder exists already, or there is no run to resume.
     """
+    is_new = config.resume is None
     if config.resume is not None:
         run_dir = create_run_dir(Path(config.resume), name="", resume=True)
         stored: Any = OmegaConf.merge(OmegaConf.structured(Config), load_config(run_dir))
@@ -119,32 +126,47 @@ def open_run(
             OmegaConf.update(stored, name, OmegaConf.select(asked, name))
         config = plain(stored)
         validate(config)
-    else:
-        _check_references(config)
-        name = f"{config.method.name}-seed{config.seed}"
-        wanted = None if config.run_dir is None else Path(config.run_dir)
-        run_dir = create_run_dir(wanted, name=name)
-        save_config(run_dir, config)
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # TorchRL sets its own when imported
-    write_metadata(run_dir, command=command)
     torch.set_num_threads(config.threads)
-    return config, run_dir
+    place = survey(config)
+    if not is_new:
+        write_metadata(run_dir, command=command)
+        return config, run_dir, place
+
+    def fill(folder: Path) -> None:
+        save_config(folder, config)
+        write_metadata(folder, command=command)
+
+    name = f"{config.method.name}-seed{config.seed}"
+    wanted = None if config.run_dir is None else Path(config.run_dir)
+    return config, create_run_dir(wanted, name=name, fill=fill), place
 
 
-def _check_references(config: Config) -> None:
-    """Raise for what cannot be resolved before there is a folder that a second try would find."""
-    resolve("env", config.env.factory)
-    resolve("method", config.method.factory)
-    for group in config.raters.groups:
-        resolve("rater", group)
-    if config.data.reader is not None:
-        resolve("reader", config.data.reader)
+@contextmanager
+def kept_unless_refused(run_dir: Path, *, is_new: bool) -> Iterator[None]:
+    """Remove a new run's folder if the block refuses what was asked for.
+
+    So that nothing stands in the way of the corrected command. A full disk or a kill is no refusal.
+
+    Args:
+        run_dir: Folder of the run.
+        is_new: Whether it began with this process; a run that is resumed keeps its folder.
+
+    Raises:
+        TypeError: What the block raises.
+        ValueError: Likewise.
+    """
+    try:
+        yield
+    except (TypeError, ValueError):
+        if is_new:
+            shutil.rmtree(run_dir, ignore_errors=True)
+        raise
 
 
-def gather(config: Config, run_dir: Path) -> Setting:
+def gather(config: Config, run_dir: Path, place: Place) -> Setting:
     """Collect segments and ask the raters, or load what an earlier run collected."""
-    world = build_world(config.env)
-    groups = build_groups(config.raters, world)
+    world, groups = place.world, place.groups
     kept = run_dir / "data"
     has_kept = (kept / "preferences").is_dir()
     load, reader = (kept, None) if has_kept else given_data(config.data)
@@ -160,6 +182,8 @@ def gather(config: Config, run_dir: Path) -> Setting:
             reader=reader,
             progress=progress.update,
         )
+    if load is None and world.collect is None:
+        check_infos(config.env, map(str, data.steps[INFO].keys()))
     if config.data.save:
         data.save(kept)
     spec = build_spec(config.method, world.env)

@@ -93,7 +93,7 @@ def test_a_resumed_run_takes_what_may_change_and_keeps_the_rest(config_of, tiny,
     first = plain(config_of(*tiny, f"run_dir={tmp_path / 'run'}", "seed=3", "threads=1"))
     open_run(first, command=["popl-train"])
     typed = [f"resume={tmp_path / 'run'}", "checkpoint_interval=4"]
-    config, run_dir = open_run(plain(config_of(*typed)), command=["popl-train"], given=typed)
+    config, run_dir, _ = open_run(plain(config_of(*typed)), command=["popl-train"], given=typed)
     assert run_dir == tmp_path / "run"
     assert config.checkpoint_interval == 4
     assert config.seed == 3
