@@ -20,7 +20,7 @@ from popl_rl.keys import ANSWER, GROUP, Answer
 from popl_rl.locks import locked
 from popl_rl.manifest import digest_of_tensors
 from popl_rl.models.hypothesis_set import HypothesisSet
-from popl_rl.models.policies import PolicySpec
+from popl_rl.models.policies import PolicySpec, Spec
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.models.sets import load_set
 from popl_rl.models.style_codes import StyleClone, load_clone, save_clone, train_clone
@@ -219,9 +219,7 @@ def _load_baselines(path: str, problem: Problem, num_groups: int) -> HypothesisS
     return loaded
 
 
-def check_baselines(
-    loaded: HypothesisSet, path: str, spec: PolicySpec | RewardSpec, num_groups: int
-) -> None:
+def check_baselines(loaded: HypothesisSet, path: str, spec: Spec, num_groups: int) -> None:
     """Raise unless baselines of another run can be those of this one.
 
     Args:
