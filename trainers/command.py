@@ -27,6 +27,7 @@ from popl_rl.config import (
     validate,
 )
 from popl_rl.trainers.spelling import explained
+from popl_rl.trainers.terminal import steady_terminal
 from popl_rl.trainers.typed import as_typed, opened
 
 __all__ = [
@@ -63,6 +64,11 @@ def run_command(main: Callable[[], Any], schema: type = Config) -> None:
         main: The function.
         schema: Dataclass of its settings, which what is misspelt is compared with.
     """
+    with steady_terminal():
+        _run(main, schema)
+
+
+def _run(main: Callable[[], Any], schema: type) -> None:
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     sys.argv[1:] = opened(sys.argv[1:])  # which Hydra reads
     if os.environ.get("HYDRA_FULL_ERROR") == "1":

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from popl_rl.trainers.command import USER_ERRORS
+from popl_rl.trainers.terminal import steady_terminal
 
 __all__ = ["cli", "main"]
 
@@ -39,7 +40,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def cli() -> None:
     """Console command ``popl-export``."""
-    sys.exit(main())
+    with steady_terminal():
+        sys.exit(main())
 
 
 if __name__ == "__main__":

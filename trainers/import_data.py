@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from popl_rl.trainers.command import USER_ERRORS, read_options
+from popl_rl.trainers.terminal import steady_terminal
 
 __all__ = ["cli", "main"]
 
@@ -75,7 +76,8 @@ def _import(
 
 def cli() -> None:
     """Console command ``popl-import``."""
-    sys.exit(main())
+    with steady_terminal():
+        sys.exit(main())
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import hydra
 
+from popl_rl.accessories import accessory
 from popl_rl.config import Config
 from popl_rl.trainers.command import given_overrides, prepare, register_schemas, run_command
 
@@ -77,7 +78,9 @@ register_schemas()
 @hydra.main(version_base="1.3", config_path="pkg://popl_rl.configs", config_name="people")
 def main(cfg: Any) -> None:
     """Hydra's entry."""
-    show(run(cfg))
+    result = run(cfg)
+    with accessory("the table was not printed", f"see report.md in {result.run_dir}"):
+        show(result)
 
 
 def cli() -> None:

@@ -19,6 +19,7 @@ from hydra import compose, initialize_config_module
 
 from popl_rl.trainers import import_data, judge_people
 from popl_rl.trainers.command import USER_ERRORS
+from popl_rl.trainers.terminal import steady_terminal
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -163,7 +164,8 @@ def _write_rows(study: str, results: "pd.DataFrame", out: Path) -> None:
 
 def cli() -> None:
     """Console command ``popl-study``."""
-    sys.exit(main())
+    with steady_terminal():
+        sys.exit(main())
 
 
 if __name__ == "__main__":

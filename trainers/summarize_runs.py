@@ -16,6 +16,7 @@ from rich.table import Table
 from popl_rl.evaluation.method_names import method_name
 from popl_rl.evaluation.statistics import HEADLINES, headline_measure, read_results, summary
 from popl_rl.experiments.report import results_table
+from popl_rl.trainers.terminal import steady_terminal
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -51,7 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def cli() -> None:
     """Console command ``popl-summarize``."""
-    sys.exit(main())
+    with steady_terminal():
+        sys.exit(main())
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import hydra
 
+from popl_rl.accessories import accessory
 from popl_rl.config import Config
 from popl_rl.trainers.command import given_overrides, prepare, register_schemas, run_command
 
@@ -65,9 +66,11 @@ def run(config: Config) -> Result:
 
         # 4. Evaluated for every hidden group; told in a table, in pictures and in words.
         board = steps.evaluate(config, setting, found, references, run_dir)
+        about = steps.describe(config, setting, found, board)
+        steps.write_report(config, board, about, {}, run_dir)
         figures = steps.draw(config, setting, found, references, board, run_dir)
+        steps.write_report(config, board, about, figures, run_dir)
         steps.log_results(logger, board, figures, method.generations)
-    steps.write_report(config, setting, found, board, figures, run_dir)
     return Result(run_dir, found, board)
 
 
@@ -130,7 +133,9 @@ def main(cfg: Any) -> None:
     env = config.env.factory if config.raters.groups else str(config.data.load)
     # Loading PyTorch takes seconds, in which a person should know that something goes on.
     sys.stderr.write(f"{method} in {env}, seed {config.seed}: loading PyTorch\n")
-    show(run(config))
+    result = run(config)
+    with accessory("the table was not printed", f"see report.md in {result.run_dir}"):
+        show(result)
 
 
 def cli() -> None:

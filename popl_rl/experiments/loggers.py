@@ -1,9 +1,10 @@
 """Where a run reports to while it goes on: Weights & Biases offline, and a progress bar."""
 
+import contextlib
 import io
 import os
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -15,6 +16,8 @@ from PIL import Image
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
+
+from popl_rl.accessories import accessory
 
 __all__ = ["Progress", "RunLogger", "make_logger"]
 
@@ -49,8 +52,50 @@ class RunLogger:
         self.close()
 
 
+class _Guarded(RunLogger):
+    """Reports to another logger until that fails, which is told once.
+
+    Args:
+        logger: The other logger.
+        abandon: Called if it fails, so that nothing of it is left to complain at exit.
+    """
+
+    def __init__(self, logger: RunLogger, abandon: Callable[[], object]) -> None:
+        self._logger = logger
+        self._abandon = abandon
+
+    def log(self, metrics: Mapping[str, float], step: int) -> None:
+        self._try(lambda logger: logger.log(metrics, step))
+
+    def log_figures(self, figures: Mapping[str, Figure | Path], step: int) -> None:
+        self._try(lambda logger: logger.log_figures(figures, step))
+
+    def log_table(self, name: str, table: pd.DataFrame) -> None:
+        self._try(lambda logger: logger.log_table(name, table))
+
+    def close(self) -> None:
+        self._try(lambda logger: logger.close())
+
+    def _try(self, report: Callable[[RunLogger], None]) -> None:
+        done = False
+        with accessory(
+            "Weights & Biases lacks what comes from here on",
+            "metrics.csv, results.csv and the report have it all",
+        ):
+            report(self._logger)
+            done = True
+        if not done:
+            self._logger = RunLogger()
+            with contextlib.suppress(Exception):
+                self._abandon()
+
+
 class _WandbRunLogger(RunLogger):
-    """Reports to an offline Weights & Biases run in the run folder, through TorchRL's logger."""
+    """Reports to an offline Weights & Biases run in the run folder, through TorchRL's logger.
+
+    A run that is resumed has a folder of its own below ``wandb``, under the id of the first, as
+    ``wandb sync <run folder>/wandb`` expects of the parts of one run.
+    """
 
     def __init__(self, run_dir: Path, *, project: str, config: dict[str, Any]) -> None:
         # Slow to import, and not needed for logger=csv.
@@ -64,6 +109,7 @@ class _WandbRunLogger(RunLogger):
         with _restored("WANDB_MODE"):
             self._logger = WandbLogger(
                 run_dir.resolve().name,
+                id=_first_id(run_dir / "wandb"),
                 offline=True,
                 save_dir=run_dir,
                 project=project,
@@ -95,6 +141,20 @@ class _WandbRunLogger(RunLogger):
     def close(self) -> None:
         self._logger.experiment.finish()
 
+    def abandon(self) -> None:
+        """Forget the helper process, which wandb would ask for more when Python exits."""
+        self._wandb.teardown()
+
+
+def _first_id(folder: Path) -> str | None:
+    """Id of the run that the folder holds parts of, as of a killed process; None if there is none.
+
+    Args:
+        folder: With folders ``offline-run-<time>-<id>``.
+    """
+    parts = sorted(folder.glob("offline-run-*-*"))
+    return parts[0].name.split("-", 3)[3] if parts else None
+
 
 def make_logger(
     name: Literal["wandb", "csv"], run_dir: Path, *, project: str, config: dict[str, Any]
@@ -120,7 +180,8 @@ def make_logger(
     if name != "wandb":
         raise ValueError(f"logger must be 'wandb' or 'csv', got {name!r}")
     try:
-        return _WandbRunLogger(run_dir, project=project, config=config)
+        logger = _WandbRunLogger(run_dir, project=project, config=config)
+        return _Guarded(logger, logger.abandon)
     except ImportError as error:
         cure = "install it with 'pip install wandb'"
         reason: Exception = error

@@ -51,6 +51,7 @@ __all__ = [
     "References",
     "Setting",
     "build",
+    "describe",
     "draw",
     "evaluate",
     "evolve",
@@ -346,19 +347,14 @@ def log_results(
     logger.log_table("results", board.results)
 
 
-def write_report(
-    config: Config,
-    setting: Setting,
-    found: HypothesisSet,
-    board: Scoreboard,
-    figures: dict[str, Path],
-    run_dir: Path,
-) -> None:
-    """Write ``report.md``."""
+def describe(
+    config: Config, setting: Setting, found: HypothesisSet, board: Scoreboard
+) -> dict[str, object]:
+    """What the report says besides the results, by name."""
     problem = setting.problem
     comparisons, method = problem.comparisons, config.method
     effective = found.effective_number(problem.bank, comparisons)
-    about = {
+    return {
         f"{found.folder} in the set": f"{len(found)}, effectively {effective:.1f}",
         "comparisons": f"{len(comparisons)} strict, {comparisons.num_dropped} ties and skips",
         "cases": f"{comparisons.num_cases} ({method.cases}s)",
@@ -366,6 +362,17 @@ def write_report(
         "seed": config.seed,
         **diagnostics(board, setting.evaluator),
     }
+
+
+def write_report(
+    config: Config,
+    board: Scoreboard,
+    about: dict[str, object],
+    figures: dict[str, Path],
+    run_dir: Path,
+) -> None:
+    """Write ``report.md``, with the figures that there are so far."""
+    method = config.method
     title = f"{'POPL: ' if method.name == 'popl' else ''}{method.name} in {config.env.factory}"
     text = markdown(
         board.results,

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from popl_rl.accessories import accessory
 from popl_rl.data.environments import World
 from popl_rl.data.rollouts import MASK
 from popl_rl.evaluation.evaluator import Evaluator
@@ -88,8 +89,8 @@ def animate(
     Returns:
         Name and file of each animation.
 
-    Raises:
-        RuntimeError: If this machine has no renderer that works; says what to set.
+    Warns:
+        UserWarning: If one cannot be recorded, as on a machine without a renderer.
     """
     policies = cast("PolicySet", found)
     env = world.make()
@@ -104,8 +105,12 @@ def animate(
             ) -> Tensor:
                 return policies.act(seen, member=member, generator=generator).clone()
 
-            paths[name] = folder / f"{name}.gif"
-            record_gif(env, act, paths[name], seed=seed)
+            path = folder / f"{name}.gif"
+            with accessory(f"there is no animation for {name}", "see what render() needs"):
+                # No longer than the episodes that were evaluated, where nothing else ends one.
+                most = max(shown.shape[-1] for shown in board.episodes.values())
+                record_gif(env, act, path, seed=seed, max_steps=most)
+                paths[name] = path
     finally:
         env.close()
     return paths

@@ -1,6 +1,7 @@
 """The pictures of a run, drawn from its files and its scoreboard."""
 
-import warnings
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
+from popl_rl.accessories import accessory
 from popl_rl.algorithms.reward_baselines import RewardBaselines
 from popl_rl.data.environments import World, offered
 from popl_rl.data.rollouts import MASK
@@ -82,41 +84,79 @@ def draw(
 
     Returns:
         Name and file of each picture.
+
+    Warns:
+        UserWarning: If pictures of a kind, or an animation, cannot be drawn; there are the others.
     """
     folder = run_dir / "figures"
-    folder.mkdir(exist_ok=True)
-    metrics = pd.read_csv(run_dir / "metrics.csv")
-    figures = {"learning": plots.learning_curves(metrics)}
-    if "selection_depth" in metrics:
-        figures["selection"] = plots.selection(metrics)
-    # Recovery is open without an oracle, or with one no better than random.
-    table = board.results
-    measured = (table.measure == headline_measure(table)) & ~table.method.isin(["oracle", "random"])
-    if table.value[measured].notna().any():
-        floor = _FLOORS[evaluator.protocol.reference]
-        figures["recovery"] = recovery_bars(table, floor=floor)
-    history = run_dir / "history.csv"
-    if history.exists() and len(evaluator.groups) > 1:
-        snapshots = pd.read_csv(history)
-        figures["members"] = _draw_members(snapshots, found, baselines, board, evaluator)
-    cells = offered(world.env, "cells")
-    if cells is not None:
-        figures["occupancy"] = _draw_occupancy(cells, board, evaluator, world)
-    figures |= draw_motion(found, board=board, evaluator=evaluator)
-    figures |= draw_rewards(
-        found, baselines, board=board, evaluator=evaluator, reward_baselines=reward_baselines
+    drawers = _drawers(run_dir, found, baselines, board, evaluator, world)
+    drawers["motion"] = partial(draw_motion, found, board=board, evaluator=evaluator)
+    drawers["rewards"] = partial(
+        draw_rewards,
+        found,
+        baselines,
+        board=board,
+        evaluator=evaluator,
+        reward_baselines=reward_baselines,
     )
-    paths = {}
-    for name, figure in figures.items():
-        paths[name] = folder / f"{name}.png"
-        save(figure, paths[name])
+    paths: dict[str, Path] = {}
+    for what, draw_figures in drawers.items():
+        with accessory(f"there is no picture of {what}", "the report has all numbers"):
+            folder.mkdir(exist_ok=True)
+            for name, figure in draw_figures().items():
+                save(figure, folder / f"{name}.png")
+                paths[name] = folder / f"{name}.png"
     if with_animations:
-        try:
-            paths |= animate(folder, found, board=board, world=world, seed=evaluator.seed)
-        except RuntimeError as error:
-            # Pictures that need a renderer are no reason to lose a run that is done.
-            warnings.warn(f"no animations were made: {error}", stacklevel=2)
+        paths |= animate(folder, found, board=board, world=world, seed=evaluator.seed)
     return paths
+
+
+def _drawers(
+    run_dir: Path,
+    found: HypothesisSet,
+    baselines: HypothesisSet | None,
+    board: Scoreboard,
+    evaluator: Evaluator,
+    world: World,
+) -> dict[str, Callable[[], dict[str, Figure]]]:
+    """What draws the pictures of a kind, by the kind; none where the run lacks the data."""
+
+    def learning() -> dict[str, Figure]:
+        metrics = pd.read_csv(run_dir / "metrics.csv")
+        figures = {"learning": plots.learning_curves(metrics)}
+        if "selection_depth" in metrics:
+            figures["selection"] = plots.selection(metrics)
+        return figures
+
+    def recovery() -> dict[str, Figure]:
+        # Recovery is open without an oracle, or with one no better than random.
+        table = board.results
+        is_open = table.method.isin(["oracle", "random"])
+        measured = (table.measure == headline_measure(table)) & ~is_open
+        if not table.value[measured].notna().any():
+            return {}
+        floor = _FLOORS[evaluator.protocol.reference]
+        return {"recovery": recovery_bars(table, floor=floor)}
+
+    def snapshots() -> dict[str, Figure]:
+        history = run_dir / "history.csv"
+        if not history.exists() or len(evaluator.groups) < 2:
+            return {}
+        drawn = _draw_members(pd.read_csv(history), found, baselines, board, evaluator)
+        return {"members": drawn}
+
+    def places() -> dict[str, Figure]:
+        cells = offered(world.env, "cells")
+        if cells is None:
+            return {}
+        return {"occupancy": _draw_occupancy(cells, board, evaluator, world)}
+
+    return {
+        "learning": learning,
+        "recovery": recovery,
+        "members": snapshots,
+        "occupancy": places,
+    }
 
 
 def _draw_members(
@@ -174,9 +214,12 @@ def picture(world: World) -> NDArray[np.uint8] | None:
     if "rgb_array" not in inner.metadata.get("render_modes", []):
         return None
     before, inner.render_mode = inner.render_mode, "rgb_array"
+    image = None
     try:
-        inner.reset(seed=0)
-        image = inner.render()
+        with accessory("there is no picture of the environment", "see what render() needs"):
+            inner.reset(seed=0)
+            image = inner.render()
+            image = None if image is None else np.asarray(image, dtype=np.uint8)
     finally:
         inner.render_mode = before
-    return None if image is None else np.asarray(image, dtype=np.uint8)
+    return image
