@@ -63,9 +63,11 @@ def main(cfg: Any) -> None:
     from rich.console import Console
 
     from popl_rl.evaluation.diagnostics import alarm
-    from popl_rl.experiments.report import results_table
+    from popl_rl.experiments.report import results_table, verdict_lines
 
     console = Console()
+    for line in verdict_lines(board.results, board.label):
+        console.print(line, soft_wrap=True)
     console.print(results_table(board.results))
     warning = alarm(board.results)
     if warning is not None:

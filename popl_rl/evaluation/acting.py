@@ -1,15 +1,15 @@
 """From hypotheses to what they do: roll policies, plan for reward functions, or choose items."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, pad
 from torch import Tensor
 
 from popl_rl.data.bank import SegmentBank
-from popl_rl.data.behaviours import random_behaviour
+from popl_rl.data.behaviours import Behaviour, random_behaviour
 from popl_rl.data.environments import World, counting_from_zero
 from popl_rl.data.rollouts import MASK
 from popl_rl.data.tables import Table, solve
@@ -57,6 +57,17 @@ class Rolling:
         """See ``Acting``."""
         return self._roll(self.policies(hypotheses))
 
+    def behaviours(self, names: Sequence[str]) -> TensorDict:
+        """Episodes ``[P, E, H]`` of P of the data's behaviours, where policies act."""
+        rolled = []
+        for name in names:
+            behaviour = self.world.behaviours[name]
+            if hasattr(behaviour, "reset"):
+                behaviour.reset()
+            rolled.append(self._roll(None, behaviour))
+        longest = max(episodes.shape[-1] for episodes in rolled)
+        return torch.cat([_padded(episodes, longest) for episodes in rolled])  # type: ignore[call-overload,no-any-return]
+
     def policies(self, hypotheses: HypothesisSet | None) -> PolicySet | Tensor | None:
         """The policies by which hypotheses act.
 
@@ -76,7 +87,9 @@ class Rolling:
             )
         return hypotheses
 
-    def _roll(self, policies: PolicySet | Tensor | None) -> TensorDict:
+    def _roll(
+        self, policies: PolicySet | Tensor | None, behaviour: Behaviour | None = None
+    ) -> TensorDict:
         return roll_out(
             self.world.make,
             policies,
@@ -84,7 +97,7 @@ class Rolling:
             max_steps=self.max_steps,
             seed=self.seed,
             greedy=self.greedy,
-            random_action=random_behaviour(self.world.env.action_space),
+            random_action=behaviour or random_behaviour(self.world.env.action_space),
         )
 
 
@@ -203,6 +216,11 @@ class Choosing:
     def _episodes(self, chosen: Tensor) -> TensorDict:
         episodes: TensorDict = self.segments[chosen]
         return episodes.set(MASK, torch.ones(episodes.shape, dtype=torch.bool))
+
+
+def _padded(episodes: TensorDict, length: int) -> TensorDict:
+    """Episodes ``[P, E, H]`` with steps that nobody took up to a length."""
+    return pad(episodes, [0, 0, 0, 0, 0, length - episodes.shape[-1]])
 
 
 def plan(rewards: RewardSet, table: Table, *, discount: float = 0.97) -> Tensor:

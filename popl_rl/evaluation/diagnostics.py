@@ -9,7 +9,7 @@ from popl_rl.evaluation.results import Scoreboard
 from popl_rl.keys import OBSERVATION
 from popl_rl.raters.condorcet import find_cycle, majority_preference
 
-__all__ = ["alarm", "diagnostics", "weak_oracles"]
+__all__ = ["alarm", "diagnostics", "unexplained", "weak_oracles"]
 
 _WEAK = 0.8  # share of the optimum below which an oracle is no measure of others
 _ITEMS = 150  # of which three are looked for that a majority prefers in a circle
@@ -24,10 +24,11 @@ def diagnostics(board: Scoreboard, evaluator: Evaluator) -> dict[str, str]:
 
     Returns:
         Sentences by what they are about: ``new raters' further answers``, how well they are met;
-        ``alarm``, see ``alarm``; ``oracle``, if one is far from the optimum of its group;
-        ``collapse``, if groups were given the same hypothesis; ``hidden context``, DPL's detector,
-        if it ran; ``majority``, if the groups, pooled in equal shares, prefer states in a circle,
-        so that no single utility can say what they want.
+        ``alarm`` and ``unexplained raters``, see ``alarm`` and ``unexplained``; ``oracle``, if one
+        is far from the optimum of its group; ``collapse``, if groups were given the same
+        hypothesis; ``hidden context``, DPL's detector, if it ran; ``majority``, if the groups,
+        pooled in equal shares, prefer states in a circle, so that no single utility can say what
+        they want.
     """
     said = {}
     row = _row_of(board.results)
@@ -39,6 +40,9 @@ def diagnostics(board: Scoreboard, evaluator: Evaluator) -> dict[str, str]:
     warning = alarm(board.results)
     if warning is not None:
         said["alarm"] = warning
+    lost = unexplained(board.results)
+    if lost is not None:
+        said["unexplained raters"] = lost
     weak = weak_oracles(board.results)
     if weak is not None:
         said["oracle"] = weak
@@ -82,6 +86,28 @@ def alarm(results: pd.DataFrame) -> str | None:
         f"({100 * row['gain']:+.1f} ± {200 * row['gain_error']:.1f} points; "
         f"{row['favourite_share']:.0%} of raters have the same favourite; effectively "
         f"{row['effective']:.1f} members): it tells nobody apart, unless everybody wants the same"
+    )
+
+
+def unexplained(results: pd.DataFrame) -> str | None:
+    """Say so if there are raters whom no member of a set explains: a group that it has lost.
+
+    It looks at answers of new raters and at no groups, as ``alarm`` does.
+
+    Args:
+        results: Rows of a scoreboard.
+
+    Returns:
+        A sentence, or None if there are none, or nothing was measured of them.
+    """
+    row = _row_of(results)
+    if row is None or not row.get("unexplained_share", 0.0) > 0:
+        return None
+    return (
+        f"{row['unexplained_share']:.0%} of new raters are explained by no member: what their "
+        f"first answers choose ranks {row['unexplained_accuracy']:.0%} of their further answers "
+        f"right, and {row['typical_accuracy']:.0%} of the typical rater's; a group may be lost, "
+        "which more raters, more answers or more members (method=popl_niches) may find"
     )
 
 

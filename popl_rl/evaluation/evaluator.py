@@ -5,8 +5,10 @@ set: ``posterior`` or ``lexicase`` catering; ``information_gain``, posterior cat
 questions that were chosen instead of drawn (curves alone); ``expectation`` or ``risk_averse``; it
 is empty where there is one hypothesis only, and for measures of a set as a whole.
 
-For each group and choice: ``return, recovery, success, accuracy, best_accuracy`` of what new raters
-are given after ``evaluation.answers`` answers; ``accuracy@K`` and ``recovery@K`` after K answers.
+For each group and choice: ``return, return_error, reward, length, recovery, success, accuracy,
+best_accuracy`` of what new raters are given after ``evaluation.answers`` answers: what episodes are
+worth to the group and the standard error of that, the environment's own reward of an episode, and
+its steps; ``accuracy@K`` and ``recovery@K`` after K answers.
 Of a set as a whole, ``best_return`` and ``best_recovery`` of the best of the members rolled out,
 without the luck of the best, and ``accurate_return`` and ``accurate_recovery`` of the member that
 ranks the group's held-out pairs best. Where the environment has a transition table, each of these
@@ -14,15 +16,15 @@ recoveries has a ``share_of_optimum`` beside it, from exact returns instead of r
 
 For the group ``all``: ``worst_recovery, worst_share_of_optimum`` and ``coverage`` of the groups.
 For a set also the number of ``distinct`` and ``effective`` members; how well it meets held-out
-raters whose groups nobody looks at (``further_accuracy, one_for_all_accuracy, gain, gain_error,
-favourite_share``, see ``popl_rl.evaluation.held_out_raters``); and of the fair choice of one panel
-of held-out raters, its accuracy for the worst rater of another panel (``fair_worst_rater``) and the
-10 % quantile (``fair_quantile``), and its recovery for the group that it serves worst
-(``fair_recovery``).
+raters whose groups nobody looks at, see ``popl_rl.evaluation.held_out_raters`` and
+``popl_rl.evaluation.unexplained_raters``; and of the fair choice of one panel of held-out raters,
+its accuracy for the worst rater of another panel (``fair_worst_rater``) and the 10 % quantile
+(``fair_quantile``), and its recovery for the group that it serves worst (``fair_recovery``).
 """
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -31,7 +33,7 @@ from torch import Tensor
 from popl_rl.algorithms.reward_baselines import RewardBaselines
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
-from popl_rl.evaluation.acting import Acting, Choosing, Optimising, Rolling
+from popl_rl.evaluation.acting import Acting, Optimising, Rolling
 from popl_rl.evaluation.best_of_set import lowest, to_roll
 from popl_rl.evaluation.catering_curves import score_curves
 from popl_rl.evaluation.chosen_questions import ask_new_raters
@@ -45,7 +47,13 @@ from popl_rl.evaluation.measures import (
 )
 from popl_rl.evaluation.optimum import ExactReturns
 from popl_rl.evaluation.protocol import EvaluationProtocol, MeasuredInfos
+from popl_rl.evaluation.references import (
+    score_behaviours,
+    score_distributional,
+    score_optimum,
+)
 from popl_rl.evaluation.results import Performance, Rows, Scoreboard, Served
+from popl_rl.evaluation.unexplained_raters import look_for_unexplained
 from popl_rl.keys import RATER
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.policy_set import PolicySet
@@ -164,17 +172,11 @@ class Evaluator:
             answers: Answers that are known of each; as configured if None.
         """
         known = self.protocol.answers if answers is None else answers
+        how: Any = {"method": method}
         picks = []
         for index, raters in enumerate(self.new_raters):
-            draw = stream(self.seed, f"lexicase catering/{index}/{known}")
-            for said in raters:
-                choice = hypotheses.cater(
-                    self.bank,
-                    said[:known],
-                    method=method,  # type: ignore[arg-type]
-                    generator=draw,
-                )
-                picks.append(choice.member)
+            how["generator"] = stream(self.seed, f"lexicase catering/{index}/{known}")
+            picks += [hypotheses.cater(self.bank, said[:known], **how).member for said in raters]
         return torch.tensor(picks).view(len(self.groups), -1)
 
     @cached_property
@@ -234,11 +236,13 @@ class Evaluator:
         if baselines is not None and base is not None:
             episodes |= self._score_baselines(baselines, base, rows)
         if reward_baselines is not None:
-            self._score_distributional(reward_baselines, rows)
+            score_distributional(rows, reward_baselines, self.acting, self.bank, self.pairs)
         for index in range(len(self.groups)):
             if cloned is not None:
                 rows.add(("clone", ""), index, cloned, torch.ones(1))
             rows.add(("random", ""), index, random, torch.ones(1))
+        score_behaviours(rows, self.acting)
+        score_optimum(rows, self._exact)
         rows.add_worst()
         return Scoreboard(rows.table(), catered, episodes, label)
 
@@ -288,7 +292,8 @@ class Evaluator:
             most = float(accuracy[:, index].max())
             for method, chosen in picks.items():
                 entry = label, method
-                rows.add(entry, index, done, served.share(index, chosen))
+                share = served.share(index, chosen)
+                rows.add(entry, index, done, share, raters=chosen.shape[1])
                 given = float(accuracy[chosen[index], index].mean())
                 rows.add_accuracy(entry, index, catered=given, best=most)
         score_hindsight(rows, label, done, [members.index(int(one)) for one in accurate])
@@ -365,7 +370,16 @@ class Evaluator:
             exact = chosen.exact[0].tolist()
             shares = [self._exact.share_of_optimum(i, value) for i, value in enumerate(exact)]
             values["fair_share_of_optimum"] = lowest(shares)
-        for measure, value in values.items():
+        lost = look_for_unexplained(
+            scores,
+            self.groups,
+            self.segment_utility,
+            new_raters=self.protocol.new_raters,
+            shares=self.shares,
+            pool=self.pool,
+            seed=self.seed,
+        )
+        for measure, value in (values | lost.measures()).items():
             rows.add_whole((label, ""), measure, value)
 
     def _score_baselines(
@@ -381,14 +395,3 @@ class Evaluator:
                 rows.add_accuracy((name, ""), index, catered=value, best=value)
                 episodes[name, group.name] = base.one(row).episodes
         return episodes
-
-    def _score_distributional(self, reward_baselines: RewardBaselines, rows: Rows) -> None:
-        assert isinstance(self.acting, Choosing)
-        for entry, score in reward_baselines.scores(self.bank).items():
-            chosen = Performance(self.acting.choose(score.cpu().unsqueeze(0)), None)
-            accuracy = group_accuracy(score.cpu().unsqueeze(0), self.pairs)[0].tolist()
-            for index, value in enumerate(accuracy):
-                rows.add(entry, index, chosen, torch.ones(1))
-                rows.add_accuracy(entry, index, catered=value, best=value)
-        for kind, model in reward_baselines.dpl.items():
-            rows.add_whole((f"dpl_{kind}", ""), "hidden_context", model.hidden_context(self.bank))

@@ -20,7 +20,7 @@ from popl_rl.raters.groups import RaterGroup
 from popl_rl.raters.pairs import PairPool
 from popl_rl.raters.people import Raters
 
-__all__ = ["Gain", "draw_held_out_raters", "favourites", "gain"]
+__all__ = ["Gain", "draw_held_out_raters", "favourites", "gain", "met_answers"]
 
 
 class Gain(NamedTuple):
@@ -88,6 +88,26 @@ def favourites(margin: Tensor, comparisons: Comparisons) -> Tensor:
     return per_case(log_likelihood(margin), comparisons).argmax(0)
 
 
+def met_answers(margin: Tensor, comparisons: Comparisons) -> Tensor:
+    """Share of each rater's answers that are ranked right by what the other half of them chooses.
+
+    Args:
+        margin: ``[N, M]``.
+        comparisons: M comparisons, a case for each of C raters, each rater's in a row.
+
+    Returns:
+        ``[C]``.
+    """
+    passes = margin > 0
+    half = torch.arange(len(comparisons)) % 2
+    met = torch.zeros(len(comparisons), dtype=torch.bool)
+    for chosen_by in (0, 1):
+        asked, further = (half == chosen_by).nonzero()[:, 0], (half != chosen_by).nonzero()[:, 0]
+        favourite = favourites(margin[:, asked], comparisons.rows(asked))
+        met[further] = passes[favourite[comparisons.case[further]], further]
+    return case_values(met.unsqueeze(0), comparisons)[0]
+
+
 def gain(margin: Tensor, pooled: Tensor | None, comparisons: Comparisons) -> Gain:
     """How much better raters' further answers are met by catering than by one hypothesis for all.
 
@@ -106,12 +126,6 @@ def gain(margin: Tensor, pooled: Tensor | None, comparisons: Comparisons) -> Gai
     alone = passes if pooled is None else torch.cat([passes, pooled.unsqueeze(0) > 0])
     one_for_all = case_values(alone, comparisons)
     one_for_all = one_for_all[one_for_all.mean(1).argmax()]
-    half = torch.arange(len(comparisons)) % 2
-    met = torch.zeros(len(comparisons), dtype=torch.bool)
-    for chosen_by in (0, 1):
-        asked, further = (half == chosen_by).nonzero()[:, 0], (half != chosen_by).nonzero()[:, 0]
-        favourite = favourites(margin[:, asked], comparisons.rows(asked))
-        met[further] = passes[favourite[comparisons.case[further]], further]
-    catered = case_values(met.unsqueeze(0), comparisons)[0]
+    catered = met_answers(margin, comparisons)
     error = float((catered - one_for_all).std() / len(catered) ** 0.5) if len(catered) > 1 else nan
     return Gain(float(catered.mean()), float(one_for_all.mean()), error)

@@ -18,6 +18,7 @@ from popl_rl.raters.pairs import PairPool
 from popl_rl.raters.people import Raters
 
 __all__ = [
+    "episode_returns",
     "group_accuracy",
     "group_returns",
     "held_out_pairs",
@@ -107,11 +108,16 @@ def group_returns(episodes: TensorDictBase, groups: Sequence[RaterGroup]) -> Ten
     Returns:
         ``[P, G]``.
     """
+    return episode_returns(episodes, groups).mean(1)
+
+
+def episode_returns(episodes: TensorDictBase, groups: Sequence[RaterGroup]) -> Tensor:
+    """Undiscounted utility of each episode to each group, as ``group_returns``, ``[P, E, G]``."""
     flat = episodes.flatten(0, 1)
     mask = flat[MASK]
     shown = _with_last_step_repeated(flat)
     returns = [torch.where(mask, group.step_utility(shown), 0).sum(1) for group in groups]
-    return torch.stack(returns, -1).view(*episodes.shape[:2], -1).mean(1)
+    return torch.stack(returns, -1).view(*episodes.shape[:2], -1)
 
 
 def _with_last_step_repeated(episodes: TensorDictBase) -> TensorDictBase:

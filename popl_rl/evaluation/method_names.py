@@ -27,11 +27,13 @@ class ReportedMethod:
             colour is free.
         is_reference: Whether it is evaluated beside the method that a run trains, so that no other
             method may have its name. The references with a colour are drawn in every figure.
+        is_shown: Whether tables and figures show it; its rows are in ``results.csv`` in any case.
     """
 
     label: str
     colour: str = ""
     is_reference: bool = False
+    is_shown: bool = True
 
 
 METHODS = {
@@ -46,6 +48,10 @@ METHODS = {
     "dpl_categorical": ReportedMethod("DPL, categorical", "", True),
     "individual": ReportedMethod("one model for each person", "", True),
     "oracle": ReportedMethod("oracle (told the groups)", "black", True),
+    "optimum": ReportedMethod("optimum", "", True, is_shown=False),
+    "best_behaviour": ReportedMethod("best behaviour in the data", "", True),
+    "data": ReportedMethod("behaviours of the data", "", True),
+    "behaviour": ReportedMethod("behaviour", "", True, is_shown=False),
     "clone": ReportedMethod("clone of the data", "", True),
     "random": ReportedMethod("random actions", "", True),
 }

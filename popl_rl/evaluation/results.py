@@ -8,8 +8,10 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from popl_rl.data.rollouts import MASK
 from popl_rl.evaluation.best_of_set import coverage, lowest
 from popl_rl.evaluation.measures import (
+    episode_returns,
     group_returns,
     info_rates,
     mean_and_peak,
@@ -20,6 +22,7 @@ from popl_rl.evaluation.measures import (
 from popl_rl.evaluation.optimum import ExactReturns
 from popl_rl.evaluation.protocol import MeasuredInfos
 from popl_rl.evaluation.statistics import RESULT_COLUMNS
+from popl_rl.keys import REWARD
 from popl_rl.raters.groups import RaterGroup
 
 __all__ = ["Performance", "Rows", "Scoreboard", "Served"]
@@ -126,7 +129,19 @@ class Rows:
         self.floor, self.oracle, self.exact = floor, oracle, exact
         self.rows: list[tuple[str, str, str, str, float]] = []
 
-    def add(self, entry: tuple[str, str], index: int, done: Performance, share: Tensor) -> None:
+    def returns(self, episodes: TensorDict) -> Tensor:
+        """Mean return of P hypotheses to every group, ``[P, G]``; see ``group_returns``."""
+        return group_returns(episodes, self.groups)
+
+    def add(
+        self,
+        entry: tuple[str, str],
+        index: int,
+        done: Performance,
+        share: Tensor,
+        *,
+        raters: int | None = None,
+    ) -> None:
         """What a method does for one group.
 
         Args:
@@ -134,10 +149,17 @@ class Rows:
             index: Index of the group.
             done: What P hypotheses do.
             share: How much each of them counts, ``[P]``.
+            raters: Number of raters that the shares are of, if they are a sample.
         """
         rolled = done.episodes
-        value = float(group_returns(rolled, self.groups)[:, index] @ share)
-        self.add_return(entry, index, value)
+        returns = episode_returns(rolled, self.groups[index : index + 1])[..., 0]
+        value = float(returns.mean(1) @ share)
+        self.add_return(entry, index, value, error=_error(returns, share, raters))
+        if REWARD in rolled.keys() and rolled.shape[-1] > 1:  # noqa: SIM118 - not a dict
+            reward = (rolled[REWARD] * rolled[MASK]).sum(-1).mean(-1)
+            self.add_value(entry, index, "reward", float(reward @ share))
+            length = rolled[MASK].sum(-1).float().mean(-1)
+            self.add_value(entry, index, "length", float(length @ share))
         if done.exact is not None:
             self.add_share(entry, index, float(done.exact[:, index] @ share.double()))
         success = float(success_rate(rolled, self.infos.success) @ share)
@@ -159,10 +181,18 @@ class Rows:
         return recovery(value, reference=low, oracle=high)
 
     def add_return(
-        self, entry: tuple[str, str], index: int, value: float, *, prefix: str = ""
+        self,
+        entry: tuple[str, str],
+        index: int,
+        value: float,
+        *,
+        prefix: str = "",
+        error: float | None = None,
     ) -> None:
-        """A mean return of episodes to one group, and the recovery that this is."""
+        """A mean return of episodes to one group, its standard error, and the recovery it is."""
         self.add_value(entry, index, f"{prefix}return", value)
+        if error is not None:
+            self.add_value(entry, index, f"{prefix}return_error", error)
         self.add_value(entry, index, f"{prefix}recovery", self.recovery(index, value))
 
     def add_share(
@@ -209,3 +239,17 @@ class Rows:
     def table(self) -> pd.DataFrame:
         """The rows so far, as a table."""
         return pd.DataFrame(self.rows, columns=RESULT_COLUMNS)
+
+
+def _error(returns: Tensor, share: Tensor, raters: int | None) -> float:
+    """Standard error of a mean return, from episodes ``[P, E]`` and from who was asked.
+
+    Episode e starts alike for all hypotheses, so that episodes, not members, are what is drawn;
+    raters are drawn independently of them. NaN with a single episode.
+    """
+    episodes = share @ returns
+    squared = episodes.var() / len(episodes) if len(episodes) > 1 else torch.tensor(torch.nan)
+    if raters is not None:
+        own = returns.mean(1)
+        squared = squared + share @ (own - share @ own).square() / raters
+    return float(squared.sqrt())

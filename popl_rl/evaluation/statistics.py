@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from popl_rl.evaluation.method_names import sort_key
+from popl_rl.evaluation.method_names import METHODS, sort_key
 
 __all__ = [
     "HEADLINES",
@@ -62,8 +62,10 @@ def headline_measure(results: pd.DataFrame) -> str:
 
 
 def entries(results: pd.DataFrame) -> list[tuple[str, str]]:
-    """Methods and choices of a results table, in the order to show them in."""
-    found = results[["method", "choice"]].drop_duplicates().itertuples(index=False, name=None)
+    """Methods and choices of a results table that are shown, in the order to show them in."""
+    hidden = [name for name, method in METHODS.items() if not method.is_shown]
+    shown = results.loc[~results["method"].isin(hidden), ["method", "choice"]]
+    found = shown.drop_duplicates().itertuples(index=False, name=None)
     # sorted() is stable: what is not listed keeps its order.
     return sorted(((str(m), str(c)) for m, c in found), key=lambda entry: sort_key(*entry))
 

@@ -67,7 +67,7 @@ def evaluate_again(config: Config, run_dir: Path, *, seed: int) -> tuple[Path, S
         **diagnostics(board, evaluator),
     }
     title = f"Evaluation {number} of {run_dir.name}"
-    report = markdown(board.results, title=title, about=about, figures=[])
+    report = markdown(board.results, title=title, about=about, figures=[], label=board.label)
     with written_beside(folder) as beside:
         save_config(
             beside, {"run_dir": str(run_dir), "evaluation": config.evaluation, "seed": seed}

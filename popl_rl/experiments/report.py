@@ -20,13 +20,23 @@ from popl_rl.evaluation.statistics import (
     rows_of,
     worst_group,
 )
+from popl_rl.evaluation.verdicts import FEW, PARTLY, SERVED, verdicts
 from popl_rl.experiments.markdown import markdown_table
 
-__all__ = ["markdown", "results_table"]
+__all__ = ["markdown", "results_table", "verdict_lines"]
+
+_COLOURS = {SERVED: "green", PARTLY: "yellow", FEW: "yellow"}  # of verdicts; red for any other
 
 _SHARES = ("success", "accuracy")
 
 _WORDS = {
+    "served": "new raters are given at least 0.8 of the best known, as far as the episodes tell: "
+    "optimum, PPO, oracle, or best behaviour in the data, whichever has the highest return.",
+    "no better than the data": "nothing was gained over what the data show, in their shares.",
+    "its oracle does not act": "a policy that is told the group's own answers is no better than "
+    "random actions, or worse than the data, so that a recovery means nothing: give all methods "
+    "more training, other data, or style codes (`method.evolve=code`).",
+    "not found": "less than half of the best known, although an oracle can do it.",
     "group": "raters who want the same. No method but the oracle is told who belongs to which.",
     "POPL (catered)": "the policy that the policy set offers to a new rater of the group after a "
     "few answers.",
@@ -72,8 +82,29 @@ def results_table(results: pd.DataFrame) -> Table:
     return table
 
 
+def verdict_lines(results: pd.DataFrame, label: str) -> list[Text]:
+    """Lines for a terminal that say how well each group is served.
+
+    Args:
+        results: Tidy rows ``method, choice, group, measure, value`` of one run.
+        label: Name of the method that was evaluated.
+
+    Raises:
+        ValueError: If a column is missing.
+    """
+    return [
+        Text(str(verdict), style=_COLOURS.get(verdict.word, "red"))
+        for verdict in verdicts(results, label)
+    ]
+
+
 def markdown(
-    results: pd.DataFrame, *, title: str, about: Mapping[str, Any], figures: Sequence[Path]
+    results: pd.DataFrame,
+    *,
+    title: str,
+    about: Mapping[str, Any],
+    figures: Sequence[Path],
+    label: str,
 ) -> str:
     """Write the text of a report.
 
@@ -82,9 +113,11 @@ def markdown(
         title: Heading.
         about: What was run, such as environment, groups and seed.
         figures: Pictures, relative to the folder of the report.
+        label: Name of the method that was evaluated.
 
     Returns:
-        Markdown: what was run, the results, the pictures, and what the words mean.
+        Markdown: a verdict for each group, what was run, the results, the pictures, and what the
+        words mean.
 
     Raises:
         ValueError: If a column is missing or a path in ``figures`` is absolute.
@@ -105,6 +138,12 @@ def markdown(
         if entry[0] not in trivial
     ]
     blocks = [f"# {title}"]
+    said = [
+        f"- **{verdict.group}**: {str(verdict).partition(': ')[2]}"
+        for verdict in verdicts(results, label)
+    ]
+    if said:
+        blocks.append("\n".join(said))
     if about:
         blocks.append(markdown_table(["", ""], [[key, value] for key, value in about.items()]))
     blocks.append("## How well is each group served?")

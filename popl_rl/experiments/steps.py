@@ -379,6 +379,7 @@ def write_report(
         title=title,
         about=about,
         figures=[Path("figures") / path.name for path in figures.values()],
+        label=board.label,
     )
     write_atomic(run_dir / "report.md", text)
 

@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from popl_rl.evaluation.statistics import RESULT_COLUMNS, summary, worst_group
-from popl_rl.experiments.report import markdown, results_table
+from popl_rl.experiments.report import markdown, results_table, verdict_lines
 
 RESULTS = pd.DataFrame(
     [
@@ -73,6 +73,7 @@ def test_the_report_has_everything() -> None:
         title="Two doors",
         about={"groups": "upper | lower", "seed": 0},
         figures=[Path("figures/learning_curves.png"), Path("figures/a b.png")],
+        label="popl",
     )
     lines = text.splitlines()
     assert lines[0] == "# Two doors"
@@ -95,21 +96,21 @@ def test_the_share_of_optimum_takes_the_place_of_recovery_where_it_is_known() ->
     assert printed(results)[0] == [
         *("method", "raters who want", "return", "share of optimum", "success", "accuracy")
     ]
-    text = markdown(results, title="t", about={}, figures=[])
+    text = markdown(results, title="t", about={}, figures=[], label="popl")
     worst = "Share of optimum of the worst-served group: POPL (catered) **0.00**, "
     assert f"{worst}CPL on everybody's answers **0.30**, oracle (told the groups) **1.00**." in text
 
 
 def test_the_report_does_without_baselines_and_pictures() -> None:
     results = RESULTS[RESULTS["measure"] == "accuracy"]
-    text = markdown(results, title="t", about={}, figures=[])
+    text = markdown(results, title="t", about={}, figures=[], label="popl")
     assert "Recovery of the worst" not in text
     assert "![" not in text
 
 
 def test_pictures_must_be_relative() -> None:
     with pytest.raises(ValueError, match=r"figures must be relative .*got \['/a\.png'\]"):
-        markdown(RESULTS, title="t", about={}, figures=[Path("/a.png")])
+        markdown(RESULTS, title="t", about={}, figures=[Path("/a.png")], label="popl")
 
 
 def test_a_missing_column_is_named() -> None:
@@ -119,7 +120,7 @@ def test_a_missing_column_is_named() -> None:
     with pytest.raises(ValueError, match=r"\['group'\] are missing"):
         worst_group(bad)
     with pytest.raises(ValueError, match=r"\['group'\] are missing"):
-        markdown(bad, title="t", about={}, figures=[])
+        markdown(bad, title="t", about={}, figures=[], label="popl")
 
 
 def test_a_summary_is_about_the_worst_group_of_each_run():
@@ -141,3 +142,20 @@ def test_a_summary_is_about_the_worst_group_of_each_run():
     assert row.worst_recovery_ci == pytest.approx(12.706 * 0.1, rel=1e-3)
     assert row.worst_recovery_min == pytest.approx(0.6)
     assert row.accuracy_gap == pytest.approx(0.05)
+
+
+def test_verdicts_come_first_in_the_report_and_on_the_terminal() -> None:
+    returns = {("popl", "posterior"): 95.0, ("oracle", ""): 100.0, ("random", ""): 0.0}
+    rows = [
+        (*entry, group, measure, number)
+        for entry, value in returns.items()
+        for group, worth in (("fast", value), ("slow", 0.1 * value if entry[1] else value))
+        for measure, number in (("return", worth), ("return_error", 1.0))
+    ]
+    results = pd.DataFrame(rows, columns=RESULT_COLUMNS)
+    first = markdown(results, title="t", about={"seed": 0}, figures=[], label="popl").splitlines()
+    assert first[2].startswith("- **fast**: served (0.95 [0.9")
+    assert first[3].startswith("- **slow**: not found (")
+    fast, slow = verdict_lines(results, "popl")
+    assert (fast.style, slow.style) == ("green", "red")
+    assert fast.plain.startswith("fast: served")

@@ -1,0 +1,79 @@
+"""What a group could get besides: of the data's behaviours, of others' models, of the optimum.
+
+Rows ``behaviour`` (its name as the choice) of each behaviour of the data, ``data`` of all of them
+in the shares of the data, ``best_behaviour`` of the one that is best for a group, and ``optimum``,
+where every transition is known.
+"""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from popl_rl.algorithms.reward_baselines import RewardBaselines
+from popl_rl.data.bank import SegmentBank
+from popl_rl.evaluation.acting import Acting, Choosing, Rolling
+from popl_rl.evaluation.measures import group_accuracy
+from popl_rl.evaluation.optimum import ExactReturns
+from popl_rl.evaluation.results import Performance, Rows
+
+__all__ = ["score_behaviours", "score_distributional", "score_optimum"]
+
+
+def score_behaviours(rows: Rows, acting: Acting) -> None:
+    """Add what the behaviours in the data are worth to each group, where there are several.
+
+    Args:
+        rows: What is added to.
+        acting: Where behaviours act. Nothing is added where items are chosen, where an environment
+            collects its data itself, or where all that the data show are random actions.
+    """
+    if not isinstance(acting, Rolling) or acting.world.collect is not None:
+        return
+    shares = {name: share for name, share in acting.world.shares.items() if share > 0}
+    if set(shares) == {"random"}:
+        return
+    done = Performance(acting.behaviours(list(shares)), None)
+    one, share = torch.ones(1), torch.tensor(list(shares.values()))
+    returns = rows.returns(done.episodes)
+    for index in range(len(rows.groups)):
+        rows.add(("data", ""), index, done, share / share.sum())
+        rows.add(("best_behaviour", ""), index, done.one(int(returns[:, index].argmax())), one)
+        for place, name in enumerate(shares):
+            rows.add(("behaviour", name), index, done.one(place), one)
+
+
+def score_distributional(
+    rows: Rows,
+    rewards: RewardBaselines,
+    acting: Acting,
+    bank: SegmentBank,
+    pairs: Mapping[int, tuple[Tensor, Tensor]],
+) -> None:
+    """Add what distributional models of rewards choose, where items are chosen.
+
+    Args:
+        rows: What is added to.
+        rewards: The models.
+        acting: A ``popl_rl.evaluation.acting.Choosing``.
+        bank: Items.
+        pairs: Preferred and other items of each group, for accuracies.
+    """
+    assert isinstance(acting, Choosing)
+    for entry, score in rewards.scores(bank).items():
+        chosen = Performance(acting.choose(score.cpu().unsqueeze(0)), None)
+        accuracy = group_accuracy(score.cpu().unsqueeze(0), pairs)[0].tolist()
+        for index, value in enumerate(accuracy):
+            rows.add(entry, index, chosen, torch.ones(1))
+            rows.add_accuracy(entry, index, catered=value, best=value)
+    for kind, model in rewards.dpl.items():
+        rows.add_whole((f"dpl_{kind}", ""), "hidden_context", model.hidden_context(bank))
+
+
+def score_optimum(rows: Rows, exact: ExactReturns | None) -> None:
+    """Add the return of the best policy of each group, where every transition is known."""
+    if exact is None:
+        return
+    for index, value in enumerate(exact.optimum.tolist()):
+        rows.add_return(("optimum", ""), index, value, error=0.0)
+        rows.add_share(("optimum", ""), index, value)
