@@ -26,6 +26,7 @@ ORACLE = "its oracle does not act"
 FEW = "too few episodes to tell"
 
 _ENOUGH = 0.8  # share of the best known at which a group is served
+_AT_LEAST = 0.6  # share that the interval must lie above
 _HALF = 0.5  # share below which its policy was not found
 _WIDE = 0.5  # width of an interval that says nothing
 _ERRORS = 1.96  # standard errors in half a 95 % interval
@@ -88,7 +89,7 @@ def verdicts(results: pd.DataFrame, label: str) -> list[Verdict]:
       actions; or the oracle is clearly worse than the data are. Unless the group is served in
       spite of that, nothing can be concluded from a recovery.
     - ``FEW``: the interval is wider than 0.5 and reaches 0.8.
-    - ``SERVED``: the interval reaches 0.8 of the best known, and is above random actions.
+    - ``SERVED``: the interval reaches 0.8 of the best known, and lies above 0.6.
     - ``DATA``: what new raters are given is not clearly better than the behaviours of the data.
     - ``LOST``: less than half of the best known; ``PARTLY``: more.
 
@@ -147,7 +148,7 @@ def _verdict(
     compared = data if data is not None and data.value > floor.value else floor
     if high >= _ENOUGH and high - low > _WIDE:
         word = FEW
-    elif high >= _ENOUGH and low > 0:
+    elif high >= _ENOUGH and low >= _AT_LEAST:
         word = SERVED
     elif oracle is not None and _does_not_act(oracle, floor, compared):
         word, reason = ORACLE, f"the oracle has {oracle.value:.4g}, "

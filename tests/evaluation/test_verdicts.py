@@ -30,6 +30,7 @@ def table(**returns):
         (SERVED, "its oracle", {"popl": 95, "oracle": 100}),
         (SERVED, "its oracle", {"popl": 79, "oracle": 100}),  # the interval reaches 80
         (PARTLY, "its oracle", {"popl": 70, "oracle": 100}),
+        (PARTLY, "its oracle", {"popl": (68, 7), "oracle": 100}),  # it reaches 0.8 from 0.54
         (LOST, "its oracle", {"popl": 36, "oracle": 100}),
         (FEW, "its oracle", {"popl": (70, 20), "oracle": 100}),
         # Both stand still: a recovery of 0.99 says nothing.
