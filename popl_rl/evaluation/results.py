@@ -152,9 +152,9 @@ class Rows:
             raters: Number of raters that the shares are of, if they are a sample.
         """
         rolled = done.episodes
-        returns = episode_returns(rolled, self.groups[index : index + 1])[..., 0]
-        value = float(returns.mean(1) @ share)
-        self.add_return(entry, index, value, error=_error(returns, share, raters))
+        returns = episode_returns(rolled, self.groups)
+        value = float(returns.mean(1)[:, index] @ share)
+        self.add_return(entry, index, value, error=_error(returns[..., index], share, raters))
         if REWARD in rolled.keys() and rolled.shape[-1] > 1:  # noqa: SIM118 - not a dict
             reward = (rolled[REWARD] * rolled[MASK]).sum(-1).mean(-1)
             self.add_value(entry, index, "reward", float(reward @ share))

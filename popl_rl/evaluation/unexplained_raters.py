@@ -46,12 +46,9 @@ class Unexplained:
     typical: float
 
     def measures(self) -> dict[str, float]:
-        """The same under the names of measures in a table of results."""
-        return {
-            "unexplained_share": self.share,
-            "unexplained_accuracy": self.accuracy,
-            "typical_accuracy": self.typical,
-        }
+        """The same under the names of measures in a table of results, without what is NaN."""
+        found = {"unexplained_share": self.share, "typical_accuracy": self.typical}
+        return found | ({"unexplained_accuracy": self.accuracy} if self.share > 0 else {})
 
 
 def find_unexplained(margin: Tensor, comparisons: Comparisons) -> Unexplained:
