@@ -53,7 +53,7 @@ def _import(
     from popl_rl.data.readers.opening import open_data
     from popl_rl.data.readers.summary import summarise
     from popl_rl.data.readers.writing import write_folder
-    from popl_rl.experiments.loggers import Progress
+    from popl_rl.experiments.progress import Progress
 
     with Progress("rows", total=None) as progress:
         data = open_data(path, reader=reader, options=options, progress=progress.update)

@@ -99,7 +99,7 @@ def _material(config: LabelConfig, out: Path) -> tuple[list[tuple[int, int]], "C
     from popl_rl.data.saved import load_segments
     from popl_rl.experiments.data import build_world
     from popl_rl.experiments.label_data import gather_segments
-    from popl_rl.experiments.loggers import Progress
+    from popl_rl.experiments.progress import Progress
     from popl_rl.models.sets import load_set
     from popl_rl.randomness import stream
     from popl_rl.web.labels import choose_pairs, kept_pairs

@@ -67,7 +67,7 @@ def run(config: BenchmarkConfig) -> Result:
     tasks = make_tasks(unfinished, run_dir)
     # Imported late, so that a wrong setting is told at once.
     from popl_rl.experiments.benchmark_report import write_report
-    from popl_rl.experiments.loggers import Progress
+    from popl_rl.experiments.progress import Progress
 
     # 2. Doing it.
     jobs = [Job(t.cell.name, t, t.cell.source.name if t.cell.source else None) for t in tasks]

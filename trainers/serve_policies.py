@@ -142,7 +142,7 @@ def _shown(
 ) -> Show:
     """Clips of the segments and of what each member does, or likes best if it cannot act."""
     from popl_rl.experiments.data import build_world
-    from popl_rl.experiments.loggers import Progress
+    from popl_rl.experiments.progress import Progress
     from popl_rl.models.policy_set import PolicySet
     from popl_rl.web.clips import Clip
     from popl_rl.web.numbers import policy_numbers

@@ -4,6 +4,7 @@ POPL (Bahlous-Boldi, Ding, Spector, Niekum, arXiv 2406.15599) with policies that
 CPL policies do. Nothing here reads or writes a file, and nothing knows who the raters are.
 """
 
+from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
@@ -51,6 +52,7 @@ class POPL:
     Attributes:
         generation: Generations done so far.
         generations: Generations after which it is finished.
+        progress: Called with the number of steps that the last training has done; None for nobody.
     """
 
     def __init__(
@@ -75,6 +77,7 @@ class POPL:
         self.generator = generator
         self.generation = 0
         self.generations = problem.generations
+        self.progress: Callable[[int], None] | None = None
 
     def step(self) -> dict[str, float]:
         """Run one generation.
@@ -128,7 +131,11 @@ class POPL:
         if self.refinement is None:
             return self.problem.calibrated(self.problem.distinct(self.population))
         refined = refine(
-            self.problem, self.population, settings=self.refinement, generator=self.generator
+            self.problem,
+            self.population,
+            settings=self.refinement,
+            generator=self.generator,
+            progress=self.progress,
         )
         found = self.problem.hypothesis_set(refined)
         found.origin = []  # trained on, they are no longer members of the population

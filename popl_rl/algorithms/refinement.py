@@ -7,7 +7,7 @@ serves: EM (Dempster, Laird and Rubin, 1977) from where evolution has ended, whi
 how many there are.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -55,6 +55,7 @@ def refine(
     *,
     settings: RefinementSettings,
     generator: torch.Generator,
+    progress: Callable[[int], None] | None = None,
 ) -> Population:
     """Choose a few members and train each on the raters whom it serves.
 
@@ -71,6 +72,7 @@ def refine(
         population: N evolved members; copied.
         settings: Steps, folds and the most members to begin with.
         generator: Source of folds and batches.
+        progress: Called with the number of steps done, now and then.
 
     Returns:
         At most ``settings.most`` members.
@@ -85,6 +87,8 @@ def refine(
         training.expect()
         # The learning rate is held for half of the blocks, then falls to zero.
         training.descend(end - begin, rate=min(1.0, 2 - 2 * block / blocks))
+        if progress is not None:
+            progress(end)
     return training.result()
 
 

@@ -5,7 +5,7 @@ from typing import Literal
 
 from popl_rl.data.readers.imported import Imported
 from popl_rl.data.readers.items import features_as_segments
-from popl_rl.experiments.loggers import Progress
+from popl_rl.experiments.progress import Progress
 from popl_rl.models.text_features import language_model_features, tfidf_features
 
 __all__ = ["encoded"]

@@ -1,4 +1,4 @@
-"""Where a run reports to while it goes on: Weights & Biases offline, and a progress bar."""
+"""Where a run reports to while it goes on: Weights & Biases offline, or nowhere."""
 
 import contextlib
 import io
@@ -13,13 +13,10 @@ from typing import Any, Literal, Self
 import pandas as pd
 from matplotlib.figure import Figure
 from PIL import Image
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-from rich.progress import Progress as RichProgress
 
 from popl_rl.accessories import accessory
 
-__all__ = ["Progress", "RunLogger", "make_logger"]
+__all__ = ["RunLogger", "make_logger"]
 
 
 class RunLogger:
@@ -206,60 +203,3 @@ def _restored(variable: str) -> Iterator[None]:
             os.environ.pop(variable, None)
         else:
             os.environ[variable] = before
-
-
-class Progress:
-    """A progress bar on stderr; silent where that is not a terminal.
-
-    Args:
-        description: What is going on.
-        total: Number of generations; None if nobody knows.
-        completed: Generations done before, when a run is resumed.
-        console: Where to draw; None for stderr.
-
-    Example:
-        >>> with Progress("training", total=60) as progress:  # doctest: +SKIP
-        ...     progress.update(1, worst_rater_accuracy=0.61)
-    """
-
-    def __init__(
-        self,
-        description: str,
-        *,
-        total: int | None,
-        completed: int = 0,
-        console: Console | None = None,
-    ) -> None:
-        console = console or Console(stderr=True)
-        self._bar = RichProgress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[metrics]}"),
-            TimeRemainingColumn(compact=True),
-            console=console,
-            disable=not console.is_terminal,
-        )
-        self._task = self._bar.add_task(description, total=total, completed=completed, metrics="")
-
-    def update(self, completed: int, **fields: float) -> None:
-        """Show how far it is.
-
-        Args:
-            completed: Generations done.
-            fields: Scalars to show beside the bar, with ``_`` in their names read as a space.
-        """
-        metrics = ", ".join(f"{name.replace('_', ' ')} {x:.3g}" for name, x in fields.items())
-        self._bar.update(self._task, completed=completed, metrics=metrics)
-
-    def __enter__(self) -> Self:
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._bar.stop()

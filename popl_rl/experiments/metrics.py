@@ -5,10 +5,11 @@ import io
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from popl_rl.storage import explaining_full_disk, write_atomic
 
-__all__ = ["MetricsWriter"]
+__all__ = ["MetricsWriter", "write_sizes"]
 
 
 class MetricsWriter:
@@ -93,3 +94,11 @@ class MetricsWriter:
             self.path.unlink()
         elif kept != text:
             write_atomic(self.path, kept)
+
+
+def write_sizes(method: Any, path: Path) -> None:
+    """How well sets of each size predict raters, by methods that count their members so."""
+    sizes = getattr(method, "sizes", None)
+    if sizes:
+        rows = [f"{size},{mean:.6f},{error:.6f}\n" for size, mean, error in sizes]
+        write_atomic(path, "".join(["members,log_likelihood,error_of_gain\n", *rows]))

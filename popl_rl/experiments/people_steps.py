@@ -16,11 +16,12 @@ from popl_rl.data.readers.opening import open_data
 from popl_rl.data.readers.summary import summarise
 from popl_rl.data.readers.writing import read_folder, write_folder
 from popl_rl.evaluation.people_statistics import PERSON_COLUMNS, summarise_people
-from popl_rl.experiments.loggers import Progress, RunLogger
+from popl_rl.experiments.loggers import RunLogger
 from popl_rl.experiments.metrics import MetricsWriter
 from popl_rl.experiments.people import Fold, People, people_of, split
 from popl_rl.experiments.people_report import people_alarm, write_people_report
 from popl_rl.experiments.people_training import Trained, judge_fold, train_on
+from popl_rl.experiments.progress import Progress
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.storage import write_atomic
 

@@ -20,7 +20,8 @@ from typing import Any
 import torch
 from omegaconf import OmegaConf
 
-from popl_rl.experiments.loggers import Progress, RunLogger, make_logger
+from popl_rl.experiments.loggers import RunLogger, make_logger
+from popl_rl.experiments.progress import Progress
 from popl_rl.storage import write_atomic, write_json, written_beside
 
 __all__ = [

@@ -29,9 +29,11 @@ from popl_rl.experiments.builders import (
 )
 from popl_rl.experiments.data import Data, given_data, make_data
 from popl_rl.experiments.evaluators import make_evaluator
-from popl_rl.experiments.loggers import Progress, RunLogger, make_logger
-from popl_rl.experiments.metrics import MetricsWriter
+from popl_rl.experiments.foresight import Foresight, last_training
+from popl_rl.experiments.loggers import RunLogger, make_logger
+from popl_rl.experiments.metrics import MetricsWriter, write_sizes
 from popl_rl.experiments.preflight import Place, check_infos, survey
+from popl_rl.experiments.progress import Progress
 from popl_rl.experiments.report import markdown
 from popl_rl.experiments.run_folder import (
     create_run_dir,
@@ -236,8 +238,10 @@ def evolve(
     history = MetricsWriter(run_dir / "history.csv")
     every, last = config.evaluation.history, method.generations
     with Progress("generations", total=last) as progress:
+        foresight = Foresight(config, method, groups=len(setting.groups))
 
         def on_generation(generation: int, values: dict[str, float]) -> None:
+            foresight(generation)
             metrics.write(generation, values)
             logger.log(values, generation)
             progress.update(generation, worst_rater_accuracy=values["worst_rater_accuracy"])
@@ -256,19 +260,14 @@ def evolve(
         metrics.truncate_to(done)
         history.truncate_to(done)
         trainer.train()
-    found = method.result()
+    with Progress("last training", total=last_training(config.method, method)) as progress:
+        if hasattr(method, "progress"):
+            method.progress = progress.update
+        found = method.result()
     found.fair_member = found.fair_among(setting.problem.bank, setting.problem.comparisons)
     save_anew(found, run_dir / found.folder)
-    _write_sizes(method, run_dir / "sizes.csv")
+    write_sizes(method, run_dir / "sizes.csv")
     return found
-
-
-def _write_sizes(method: Method, path: Path) -> None:
-    """How well sets of each size predict raters, by methods that count their members so."""
-    sizes = getattr(method, "sizes", None)
-    if sizes:
-        rows = [f"{size},{mean:.6f},{error:.6f}\n" for size, mean, error in sizes]
-        write_atomic(path, "".join(["members,log_likelihood,error_of_gain\n", *rows]))
 
 
 def train_references(config: Config, setting: Setting, run_dir: Path) -> References:
@@ -306,12 +305,13 @@ def evaluate(
     run_dir: Path,
 ) -> Scoreboard:
     """What the set is worth to every group; writes ``results.csv``."""
-    board = setting.evaluator.score(
-        found,
-        references.baselines,
-        reward_baselines=references.rewards,
-        label=config.method.name,
-    )
+    with Progress("evaluation", total=None):
+        board = setting.evaluator.score(
+            found,
+            references.baselines,
+            reward_baselines=references.rewards,
+            label=config.method.name,
+        )
     write_atomic(run_dir / "results.csv", board.results.to_csv(index=False))
     return board
 

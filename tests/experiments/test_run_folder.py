@@ -18,8 +18,9 @@ from omegaconf import OmegaConf
 from rich.console import Console
 
 from popl_rl.config import load_config
-from popl_rl.experiments.loggers import Progress, make_logger
+from popl_rl.experiments.loggers import make_logger
 from popl_rl.experiments.metrics import MetricsWriter
+from popl_rl.experiments.progress import Progress, in_words
 from popl_rl.experiments.run_folder import (
     create_run_dir,
     git_state,
@@ -333,8 +334,33 @@ def test_progress_shows_generations_and_metrics_in_a_terminal() -> None:
     assert "worst rater accuracy 0.612, loss 2" in shown
 
 
-def test_progress_is_silent_elsewhere(capfd: pytest.CaptureFixture[str]) -> None:
+def test_progress_of_a_moment_is_silent_elsewhere(capfd: pytest.CaptureFixture[str]) -> None:
     with Progress("training", total=5) as progress:
         progress.update(5, loss=1.0)
     output = capfd.readouterr()
     assert output.out == output.err == ""
+
+
+def test_progress_is_a_line_now_and_then_elsewhere(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Five steps of four seconds: a line after 12 seconds, at 3 of 5, and one at the end."""
+    clock = iter([0.0, 4.0, 8.0, 12.0, 16.0, 20.0, 21.0])
+    monkeypatch.setattr("popl_rl.experiments.progress.time.monotonic", lambda: next(clock))
+    with Progress("training", total=5) as progress:
+        for step in range(1, 6):
+            progress.update(step, loss=1.0)
+    lines = capfd.readouterr().err.splitlines()
+    assert lines == [
+        "training: 3 of 5 (60%), about 8 s left; loss 1",
+        "training: done in about 21 s",
+    ]
+
+
+def test_times_are_told_as_people_say_them() -> None:
+    assert [in_words(seconds) for seconds in (0.2, 61, 240, 7200)] == [
+        "about 1 s",
+        "about 61 s",
+        "about 4 minutes",
+        "about 2.0 hours",
+    ]

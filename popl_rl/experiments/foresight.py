@@ -1,0 +1,71 @@
+"""How long a run will take, told as soon as one generation has been timed."""
+
+import sys
+import time
+
+from popl_rl.algorithms.problem import Method
+from popl_rl.config import Config, MethodConfig
+from popl_rl.experiments.progress import in_words
+
+__all__ = ["Foresight", "last_training"]
+
+#: A step of few networks takes at least this share of the time of a step of all members, because
+#: much of a step's time does not depend on their number.
+_LEAST = 0.25
+
+
+def last_training(config: MethodConfig, method: Method) -> int | None:
+    """Steps of the last training after all generations; None if a method has none."""
+    return config.refinement.steps if getattr(method, "refinement", None) is not None else None
+
+
+class Foresight:
+    """Says on stderr what is still to come, and how long it will take, after the first generation.
+
+    The time of a step of gradient descent is taken from that generation, so that it is an estimate.
+    The evaluation's time is not foreseen.
+
+    Args:
+        config: Settings of the run.
+        method: What is trained.
+        groups: Number of groups, each of which has an oracle.
+    """
+
+    def __init__(self, config: Config, method: Method, *, groups: int) -> None:
+        self.config, self.method, self.groups = config, method, groups
+        self.began = time.monotonic()
+        self.was_told = False
+
+    def __call__(self, generation: int) -> None:
+        """Call when a generation is done."""
+        if not self.was_told:
+            self.was_told = True
+            total, parts = self.ahead(generation, time.monotonic() - self.began)
+            sys.stderr.write(f"{in_words(total)} ahead: {', '.join(parts)}; then the evaluation\n")
+            sys.stderr.flush()
+
+    def ahead(self, generation: int, seconds: float) -> tuple[float, list[str]]:
+        """Seconds that are ahead, and what they are for.
+
+        Args:
+            generation: Generations done.
+            seconds: What the last one took.
+        """
+        method = self.config.method
+        left = max(self.method.generations - generation, 0)
+        per_step = seconds * self.method.generations / method.training.steps
+        total, parts = left * seconds, [f"{left} generations"]
+        steps = last_training(method, self.method)
+        if steps is not None:
+            most = (method.refinement.folds + 1) * method.refinement.most
+            total += steps * per_step * self._share(most)
+            parts.append("one last training")
+        if self.config.evaluation.baselines and self.config.evaluation.baselines_from is None:
+            total += method.training.steps * per_step * self._share(1 + self.groups)
+            parts.append(f"pooled CPL and {self.groups} oracles")
+        return total, parts
+
+    def _share(self, networks: int) -> float:
+        """Time of a step of some networks, in steps of all members."""
+        members = max(len(self.method.population), 1)
+        return _LEAST + (1 - _LEAST) * networks / members
