@@ -1,4 +1,4 @@
-"""How long a run will take, told as soon as one generation has been timed."""
+"""How long a run will take, told as soon as a generation has been timed."""
 
 import sys
 import time
@@ -12,6 +12,7 @@ __all__ = ["Foresight", "last_training"]
 #: A step of few networks takes at least this share of the time of a step of all members, because
 #: much of a step's time does not depend on their number.
 _LEAST = 0.25
+_LONG = 30.0  # seconds of a first generation after which one does not wait for the second
 
 
 def last_training(config: MethodConfig, method: Method) -> int | None:
@@ -20,9 +21,9 @@ def last_training(config: MethodConfig, method: Method) -> int | None:
 
 
 class Foresight:
-    """Says on stderr what is still to come, and how long it will take, after the first generation.
+    """Says on stderr what is still to come, and how long it will take, after the first generations.
 
-    The time of a step of gradient descent is taken from that generation, so that it is an estimate.
+    The time of a step of gradient descent is taken from the last one, so that it is an estimate.
     The evaluation's time is not foreseen.
 
     Args:
@@ -34,15 +35,21 @@ class Foresight:
     def __init__(self, config: Config, method: Method, *, groups: int) -> None:
         self.config, self.method, self.groups = config, method, groups
         self.began = time.monotonic()
+        self.timed = 0
         self.was_told = False
 
     def __call__(self, generation: int) -> None:
         """Call when a generation is done."""
-        if not self.was_told:
-            self.was_told = True
-            total, parts = self.ahead(generation, time.monotonic() - self.began)
-            sys.stderr.write(f"{in_words(total)} ahead: {', '.join(parts)}; then the evaluation\n")
-            sys.stderr.flush()
+        self.timed += 1
+        now = time.monotonic()
+        seconds, self.began = now - self.began, now
+        # The first one also loads what is needed for the first time: it is asked if it is long.
+        if self.was_told or (self.timed == 1 and seconds < _LONG):
+            return
+        self.was_told = True
+        total, parts = self.ahead(generation, seconds)
+        sys.stderr.write(f"{in_words(total)} ahead: {', '.join(parts)}; then the evaluation\n")
+        sys.stderr.flush()
 
     def ahead(self, generation: int, seconds: float) -> tuple[float, list[str]]:
         """Seconds that are ahead, and what they are for.

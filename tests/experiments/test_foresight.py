@@ -30,6 +30,8 @@ def test_it_follows_from_one_generation_by_hand(foresight):
 
 def test_it_is_told_once(foresight, capsys):
     foresight(1)
+    assert capsys.readouterr().err == ""
     foresight(2)
+    foresight(3)
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith("then the evaluation")
