@@ -287,7 +287,9 @@ def _is_path(source: str) -> bool:
 def _import(kind: Kind, reference: str, name: str) -> ModuleType:
     try:
         return importlib.import_module(name)
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
         missing = isinstance(error, ModuleNotFoundError) and name.startswith(str(error.name))
         cure = (
             f" Is it installed, or did you mean the file '{name.replace('.', '/')}.py:...'?"
@@ -323,7 +325,9 @@ def _load_file(kind: Kind, reference: str, source: str) -> ModuleType:
     sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
         del sys.modules[name]
         raise ValueError(
             f"{kind} {reference!r}: running {path} failed with {described(error)}"

@@ -76,8 +76,8 @@ def _run(main: Callable[[], Any], schema: type) -> None:
         return
     # Without this Hydra prints errors its own way and leaves with 1, whatever they are.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    sys.argv[1:] = as_typed(sys.argv[1:], schema)
     try:
+        sys.argv[1:] = as_typed(sys.argv[1:], schema)
         main()
     except KeyboardInterrupt:
         _print_error("\ninterrupted; continue with resume=<folder of the run>")
@@ -89,18 +89,19 @@ def _run(main: Callable[[], Any], schema: type) -> None:
         del os.environ["HYDRA_FULL_ERROR"]
 
 
-def prepare(config: Any) -> Config:
+def prepare(config: Any, given: Sequence[str] | None = None) -> Config:
     """The settings of a run as dataclasses, after every check that needs nothing but them.
 
     Args:
         config: What Hydra composed, or the dataclass.
+        given: Overrides that were typed; those of Hydra's command line if None.
 
     Raises:
         ValueError: Listing every problem, also settings given on the command line that the chosen
             method does not read, that change nothing, or that a run which is resumed has already.
     """
     settings: Config = plain(config)
-    given = given_overrides()
+    given = given_overrides() if given is None else given
     if settings.resume is not None:
         refused = fixed(given)
         if refused:

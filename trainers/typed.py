@@ -13,6 +13,11 @@ from popl_rl.config import OPEN
 
 __all__ = ["as_typed", "opened"]
 
+#: Groups of settings that are chosen by a name, each with a choice.
+_GROUPS = {"env": "two_doors", "raters": "two_groups", "method": "popl", "logger": "csv"}
+#: One name, or several for a sweep, quoted or not.
+_CHOICE = re.compile(r"""(['"]?[\w./-]*[A-Za-z][\w./-]*['"]?,?)+|(choice|glob)\(.*\)""")
+
 
 def opened(overrides: Sequence[str]) -> list[str]:
     """Overrides whose arguments of a factory may be new, with the plus that Hydra wants there.
@@ -42,12 +47,20 @@ def as_typed(arguments: Sequence[str], schema: type) -> list[str]:
     Returns:
         The arguments for Hydra. Values that are lists, mappings or sweeps with functions are left
         as they are; each value of a sweep ``a,b`` is looked at by itself.
+
+    Raises:
+        ValueError: If a group of settings is given something else than the name of a choice.
     """
     texts = set(_texts(schema))
     parser = OverridesParser.create()
     kept = []
     for argument in arguments:
         key, equals, value = argument.partition("=")
+        if key in _GROUPS and equals and not _CHOICE.fullmatch(value):
+            raise ValueError(
+                f"{key} must be a choice by its name, as in {key}={_GROUPS[key]}, got {argument}; "
+                f"settings of it are given one by one, as in {key}.name=value"
+            )
         if equals and key.lstrip("+") in texts:
             argument = f"{key}={','.join(_quoted(part, parser) for part in value.split(','))}"
         kept.append(argument)

@@ -85,6 +85,7 @@ class RefinementSettings:
         at.not_negative(self, "steps")
         at.at_least_one(self, "most")
         at.expect(self.folds >= 2, "folds", "at least 2", self.folds)
+        at.not_negative(self, "folds", most=1000)
 
 
 @dataclass
@@ -128,6 +129,7 @@ class MixtureSettings:
         names = ("mixtures", "generations", "steps", "block", "bundle", "first_selection")
         at.at_least_one(self, *names, "final_steps", "final_batch_size")
         at.expect(self.folds >= 2, "folds", "at least 2", self.folds)
+        at.not_negative(self, "folds", most=1000)
         at.positive(self, "alpha", most=1000)
         at.share(self, "conservatism")
         at.expect(0 <= self.slip < 0.5, "slip", "in [0, 0.5)", self.slip)

@@ -13,7 +13,7 @@ CHANGEABLE = ("threads", "checkpoint_interval", "logger", "evaluation.animate")
 
 
 def changing_nothing(overrides: Sequence[str]) -> list[str]:
-    """Name overrides with an empty mapping, which is merged with what is there already.
+    """Name overrides with an empty mapping, which is merged with what is there, and deletions.
 
     Args:
         overrides: As given on the command line, such as ``"env.mixture={}"``.
@@ -21,6 +21,11 @@ def changing_nothing(overrides: Sequence[str]) -> list[str]:
     problems = []
     for override in overrides:
         key, _, value = override.lstrip("+").partition("=")
+        if key.startswith("~"):
+            if not key[1:].startswith(tuple(f"{name}." for name in OPEN)):
+                cure = f"give another value, as in {key[1:]}=..."
+                problems.append(f"{key} deletes nothing, because every setting has a value: {cure}")
+            continue
         if value.replace(" ", "") == "{}":
             cure = f"delete single entries, as in ~{key.lstrip('~')}.name"
             cure = "give null for equal shares" if key == "env.mixture" else cure

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, Protocol
 
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
 
 from popl_rl.config.checks import Checker
 from popl_rl.config.data import DataConfig, EnvConfig, RatersConfig
@@ -114,7 +114,7 @@ def plain(config: Any) -> Any:
         config: A ``DictConfig`` with a schema of this package, or such a dataclass.
 
     Raises:
-        ValueError: If there are settings that the schema does not know.
+        ValueError: If there are settings that the schema does not know, or lists within lists.
     """
     if not isinstance(config, DictConfig):
         return config
@@ -124,7 +124,22 @@ def plain(config: Any) -> Any:
             f"there is no such setting as {', '.join(unknown)}; what is appended with a plus are "
             f"arguments, in {', '.join(OPEN)}"
         )
+    nested = list(_nested(config, ""))
+    if nested:
+        raise ValueError(f"entries of lists must be no lists or mappings, got {', '.join(nested)}")
     return OmegaConf.to_object(config)
+
+
+def _nested(config: DictConfig, path: str) -> Iterator[str]:
+    """Lists of settings that hold lists or mappings, which no setting does."""
+    if not is_dataclass(OmegaConf.get_type(config)):
+        return
+    for name in config:
+        value = None if OmegaConf.is_missing(config, name) else config[name]
+        if isinstance(value, DictConfig):
+            yield from _nested(value, f"{path}{name!s}.")
+        elif isinstance(value, ListConfig) and any(map(OmegaConf.is_config, value)):
+            yield f"{path}{name!s}={value}"
 
 
 def _unknown(config: DictConfig, path: str) -> Iterator[str]:

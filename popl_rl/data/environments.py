@@ -117,8 +117,8 @@ def make_world(
                 f"env.factory {factory!r} cannot be built with id {env_id!r} and options "
                 f"{options}: {error} ({defined(make_env)})"
             ) from error
-        except (Exception, SystemExit) as error:
-            if not is_foreign(make_env):
+        except BaseException as error:
+            if isinstance(error, KeyboardInterrupt) or not is_foreign(make_env):
                 raise  # ours say in their own words which option is off
             raise failure("env", factory, "making it", error, make_env) from error
         if not isinstance(env, gymnasium.Env):

@@ -166,8 +166,8 @@ def build_method(
             f"method {config.name!r}: {config.factory} was called with problem, generator and "
             f"{sorted([*sections, *config.options])}, and failed: {error} ({defined(factory)})"
         ) from error
-    except (Exception, SystemExit) as error:
-        if not is_foreign(factory):
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt) or not is_foreign(factory):
             raise
         raise failure("method", config.name, "building it", error, factory) from error
     return checked_method(method, config.name)

@@ -23,6 +23,7 @@ from popl_rl.experiments.builders import build_spec, check_baselines
 from popl_rl.experiments.data import build_groups, build_world
 from popl_rl.keys import INFO
 from popl_rl.models.sets import load_set
+from popl_rl.plug_ins import located
 from popl_rl.raters.groups import RaterGroup
 from popl_rl.registry import resolve
 
@@ -70,7 +71,7 @@ def survey(config: Config) -> Place | None:
         _check_fit(groups, world.env)
         episode = _random_episode(world, config.env.max_steps)
         for group in groups:
-            group.step_utility(episode)
+            _check_rater(group, episode)
         _check_constant_infos(config.env, world, episode)
         _check_lengths(config, world)
         spec = build_spec(config.method, world.env)
@@ -119,6 +120,23 @@ def _check_fit(groups: Sequence[RaterGroup], env: gymnasium.Env[Any, Any]) -> No
         against = None if fits is None else fits(env.unwrapped)
         if against is not None:
             raise ValueError(f"raters.groups: {group.name!r} has no place here: {against}")
+
+
+def _check_rater(group: RaterGroup, episode: TensorDictBase) -> None:
+    """Raise if a rater changes what it is shown, or changes its mind."""
+    shown = episode.clone()
+    utility = group.step_utility(shown)
+    with located(group.utility):
+        if not bool((shown == episode).all()):
+            raise ValueError(
+                f"rater {group.name!r} must leave segments as they are, but changed them; work on "
+                "a copy, as in segments['action'].clone()"
+            )
+        if not torch.equal(utility, group.step_utility(shown)):
+            raise ValueError(
+                f"rater {group.name!r} must give the same utility each time, but a second call "
+                "differed; leave randomness to raters.response"
+            )
 
 
 def _random_episode(world: World, max_steps: int) -> TensorDictBase:

@@ -1,0 +1,88 @@
+"""Faults by the hundred: what people type, what plug-ins do, what happens to files.
+
+Everything is drawn from a seed and bounded by time. ``POPL_CAMPAIGN`` is the share of the cases
+that is run, 1 if it is not set. A case passes if it is refused with a reason, or does what it
+should.
+"""
+
+import os
+import random
+import sys
+import time
+from dataclasses import dataclass
+
+import pytest
+
+from popl_rl.trainers import train_popl
+
+#: A run to its report in a few seconds.
+TINY = [
+    "env.options.size=7",
+    "env.max_steps=20",
+    "method.generations=2",
+    "method.members=3",
+    "method.training.steps=8",
+    "method.training.batch_size=16",
+    "method.refinement.steps=4",
+    "method.popl.specialist_steps=2",
+    "method.popl.pooled_steps=2",
+    "method.hidden=[4]",
+    "data.segments=60",
+    "data.length=5",
+    "raters.count=6",
+    "raters.answers=6",
+    "evaluation.episodes=4",
+    "evaluation.new_raters=2",
+    "evaluation.answers=3",
+    "evaluation.curve=[2]",
+    "evaluation.curve_members=2",
+    "evaluation.pairs=40",
+    "evaluation.history=0",
+    "logger=csv",
+]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a command ended: exit code, what was printed, seconds."""
+
+    code: int
+    text: str
+    seconds: float
+
+
+@pytest.fixture(scope="session")
+def tiny_settings():
+    """``TINY``; the first is for two doors alone."""
+    return list(TINY)
+
+
+@pytest.fixture(scope="session")
+def part():
+    """Takes from a list of cases the share that is to be run, in an order drawn from a seed."""
+
+    def take(cases, seed=0):
+        share = float(os.environ.get("POPL_CAMPAIGN", "1"))
+        count = max(1, round(share * len(cases)))
+        return random.Random(seed).sample(cases, count)
+
+    return take
+
+
+@pytest.fixture
+def train(monkeypatch, tmp_path, capsys):
+    """Runs ``popl-train`` in an empty folder, in this process; what it raises is a failure."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+
+    def run(*overrides, tiny=tuple(TINY)):
+        monkeypatch.setattr(sys, "argv", ["popl-train", *tiny, *overrides])
+        started, code = time.monotonic(), 0
+        capsys.readouterr()
+        try:
+            train_popl.cli()
+        except SystemExit as leave:
+            code = leave.code
+        return Outcome(code, "".join(capsys.readouterr()), time.monotonic() - started)
+
+    return run
