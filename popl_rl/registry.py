@@ -1,13 +1,12 @@
 """A reference becomes an object: a name, ``package.module:attr``, or ``path/file.py:attr``.
 
-Arguments may follow a rater's reference: ``ring(1, 12)`` is the function registered as ``ring``,
-called with the segments, 1 and 12. So one function stands for a family of groups.
+Arguments may follow a rater's reference, so that one function stands for a family of groups:
+``ring(1, 12)`` is the function registered as ``ring``, called with the segments, 1 and 12.
 
 Nothing is known here by name. Objects are found because they were decorated (``env``, ``rater``,
-``behaviour``) or because an installed package declares them as entry points in the group of its
-kind: ``popl_rl.env``, ``popl_rl.rater``, ``popl_rl.behaviour``, ``popl_rl.selection``,
-``popl_rl.method`` or ``popl_rl.reader``. References, not objects, are what configurations and
-worker processes carry.
+``behaviour``) or because an installed package declares them as entry points in the group of their
+kind, such as ``popl_rl.env``. References, not objects, are what configurations and worker
+processes carry.
 """
 
 import ast
@@ -291,11 +290,8 @@ def _import(kind: Kind, reference: str, name: str) -> ModuleType:
         raise
     except BaseException as error:
         missing = isinstance(error, ModuleNotFoundError) and name.startswith(str(error.name))
-        cure = (
-            f" Is it installed, or did you mean the file '{name.replace('.', '/')}.py:...'?"
-            if missing
-            else ""
-        )
+        meant = f" Is it installed, or did you mean the file '{name.replace('.', '/')}.py:...'?"
+        cure = meant if missing else ""
         raise ValueError(
             f"{kind} {reference!r}: importing module {name!r} failed with "
             f"{described(error)}.{cure} {_FORMS}"
