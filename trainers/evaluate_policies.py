@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 import hydra
 from omegaconf import OmegaConf
 
-from popl_rl.config import Checker, Config, EvaluateConfig, load_config, validate
+from popl_rl.config import Checker, Config, EvaluateConfig, validate
+from popl_rl.experiments.run_manifest import load_run_config
 from popl_rl.trainers.command import register_schemas, run_command
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ def run(config: EvaluateConfig) -> tuple[Path, "Scoreboard"]:
 
 def _settings(config: EvaluateConfig, run_dir: Path, *, has_data: bool) -> Any:
     """The run's settings with what is given in their place, checked."""
-    settings: Any = OmegaConf.merge(OmegaConf.structured(Config), load_config(run_dir))
+    settings: Any = OmegaConf.merge(OmegaConf.structured(Config), load_run_config(run_dir))
     # Baselines, and data if they were saved, are in the run's folder by now.
     settings.evaluation.baselines_from = None
     if has_data:

@@ -45,19 +45,20 @@ def run(config: Config) -> Result:
     # Imported late, so that a wrong setting is told at once.
     from popl_rl.experiments import people_steps, steps
 
-    config, run_dir, _ = steps.open_run(config, command=sys.argv, given=given_overrides())
-    people = people_steps.read_people(config, run_dir)
-    told = ["oracle"] if any(people.groups) and config.method.ties == "drop" else []
-    methods = [*people_steps.REFERENCES, *told, *config.people.methods]
-    table = people_steps.compare_methods(
-        config,
-        people,
-        methods=methods,
-        folds=range(config.people.folds),
-        cells=run_dir / "cells",
-    )
-    title = f"Real people: {', '.join(config.people.methods)}"
-    results = people_steps.finish_people(config, people, table, run_dir, title=title)
+    opened = steps.open_run(config, command=sys.argv, given=given_overrides())
+    with opened as (config, run_dir, _):
+        people = people_steps.read_people(config, run_dir)
+        told = ["oracle"] if any(people.groups) and config.method.ties == "drop" else []
+        methods = [*people_steps.REFERENCES, *told, *config.people.methods]
+        table = people_steps.compare_methods(
+            config,
+            people,
+            methods=methods,
+            folds=range(config.people.folds),
+            cells=run_dir / "cells",
+        )
+        title = f"Real people: {', '.join(config.people.methods)}"
+        results = people_steps.finish_people(config, people, table, run_dir, title=title)
     return Result(run_dir, results)
 
 

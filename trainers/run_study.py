@@ -86,17 +86,18 @@ def _tell_delivery(data: Path, out: Path) -> None:
     """What held-out people are given does on the board, and how people answer."""
     from omegaconf import OmegaConf
 
-    from popl_rl.config import Config, load_config, plain
+    from popl_rl.config import Config, plain
     from popl_rl.data.readers.opening import open_data
     from popl_rl.experiments import delivery_study
     from popl_rl.experiments.people import people_of
+    from popl_rl.experiments.run_manifest import load_run_config
     from popl_rl.plotting.delivery_plots import delivery_walks
     from popl_rl.plotting.style import save
     from popl_rl.registry import resolve
     from popl_rl.storage import write_atomic
 
     run_dir = out / "comparison"
-    config = plain(OmegaConf.merge(OmegaConf.structured(Config), load_config(run_dir)))
+    config = plain(OmegaConf.merge(OmegaConf.structured(Config), load_run_config(run_dir)))
     read = open_data(data, reader=config.data.reader, options=config.data.reader_options)
     people = people_of(read, config.method)
     grid = resolve("env", "delivery")(board=str(data))

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any, cast
 import hydra
 from omegaconf import OmegaConf
 
-from popl_rl.config import Config, ServeConfig, load_config, plain, validate
+from popl_rl.config import Config, ServeConfig, plain, validate
+from popl_rl.experiments.run_manifest import load_run_config
 from popl_rl.trainers.command import register_schemas, run_command
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def prepare(config: ServeConfig) -> Serving:
     config = plain(config)
     validate(config)
     run_dir = Path(config.run_dir)
-    stored: Config = plain(OmegaConf.merge(OmegaConf.structured(Config), load_config(run_dir)))
+    stored: Config = plain(OmegaConf.merge(OmegaConf.structured(Config), load_run_config(run_dir)))
     from popl_rl.web.extra import require_extra
 
     require_extra()
@@ -100,13 +101,15 @@ def _caterer(config: ServeConfig, run_dir: Path, world: "World") -> "Caterer":
     """The set of a run, and what people may be asked about."""
     from popl_rl.data.environments import indexed
     from popl_rl.data.saved import load_segments
-    from popl_rl.models.sets import load_set
+    from popl_rl.experiments.run_manifest import check_own_data
+    from popl_rl.experiments.run_sets import load_own_set
     from popl_rl.randomness import stream
     from popl_rl.web.catering import Caterer, candidate_pairs
     from popl_rl.web.person_store import PersonStore
 
     options, data = config.serve, run_dir / "data"
-    policies = load_set(_place(run_dir))
+    policies = load_own_set(run_dir, _place(run_dir).name)
+    check_own_data(run_dir)
     if not (data / "segments").is_dir():
         raise ValueError(f"{run_dir} holds no data to ask about; train with data.save=true")
     segments = load_segments(data / "segments")
@@ -192,11 +195,11 @@ def _everybody(
     run_dir: Path, policies: "HypothesisSet", segments: "TensorDictBase"
 ) -> "HypothesisSet":
     """The hypothesis for everybody: trained on all answers, or else the fair one of the set."""
-    from popl_rl.models.sets import load_set
+    from popl_rl.experiments.run_sets import load_own_set
     from popl_rl.storage import load_tensordict
 
     if (run_dir / "baselines").is_dir():
-        pooled = load_set(run_dir / "baselines").subset([0])
+        pooled = load_own_set(run_dir, "baselines").subset([0])
         if type(pooled) is type(policies):
             return pooled
     preferences = load_tensordict(run_dir / "data" / "preferences")

@@ -23,6 +23,7 @@ from popl_rl.trainers.command import given_overrides, prepare, register_schemas,
 
 if TYPE_CHECKING:
     from popl_rl.evaluation.results import Scoreboard
+    from popl_rl.experiments.preflight import Place
     from popl_rl.models.hypothesis_set import HypothesisSet
 
 
@@ -48,9 +49,16 @@ def run(config: Config) -> Result:
     # Imported late, so that a wrong setting is told at once.
     from popl_rl.experiments import steps
 
-    config, run_dir, place = steps.open_run(config, command=sys.argv, given=given_overrides())
-    if place is None:
-        return _run_people(config, run_dir)
+    opened = steps.open_run(config, command=sys.argv, given=given_overrides())
+    with opened as (config, run_dir, place):
+        if place is None:
+            return _run_people(config, run_dir)
+        return _run_groups(config, run_dir, place, is_new=is_new)
+
+
+def _run_groups(config: Config, run_dir: Path, place: "Place", *, is_new: bool) -> Result:
+    """Learn from simulated raters of hidden groups, and judge by what each group gets."""
+    from popl_rl.experiments import steps
 
     # 1. World, raters, and what they say; the population to start from.
     with steps.kept_unless_refused(run_dir, is_new=is_new):
@@ -79,6 +87,7 @@ def _run_people(config: Config, run_dir: Path) -> Result:
     from popl_rl.evaluation.results import Scoreboard
     from popl_rl.experiments import people_steps, steps
     from popl_rl.experiments.people import split
+    from popl_rl.experiments.run_sets import save_anew
 
     # 1. What people said, and who of them is held out.
     people = people_steps.read_people(config, run_dir)
@@ -88,7 +97,7 @@ def _run_people(config: Config, run_dir: Path) -> Result:
     with steps.open_logger(config, run_dir) as logger:
         trained = people_steps.evolve_people(config, people, fold, run_dir, logger)
         assert trained.found is not None
-        steps.save_anew(trained.found, run_dir / trained.found.folder)
+        save_anew(trained.found, run_dir / trained.found.folder, run_dir)
 
     # 3. Judged by the people held out, beside one hypothesis for all and one for each person.
     table = people_steps.compare_methods(

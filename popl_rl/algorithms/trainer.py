@@ -38,6 +38,7 @@ class MethodTrainer(Trainer):
         checkpoint_dir: Folder of the checkpoints; created with the first one.
         checkpoint_interval: Generations between two checkpoints.
         on_generation: Called with the number of generations done and the scalars of the last one.
+        run: Id of the run, which checkpoints keep: those of another run are not resumed from.
 
     Raises:
         ValueError: If ``generations`` or ``checkpoint_interval`` is not positive.
@@ -60,6 +61,7 @@ class MethodTrainer(Trainer):
         checkpoint_dir: Path,
         checkpoint_interval: int,
         on_generation: Callable[[int, dict[str, float]], None],
+        run: str | None = None,
     ) -> None:
         for name, value in [
             ("generations", generations),
@@ -68,7 +70,7 @@ class MethodTrainer(Trainer):
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
         super().__init__(
-            collector=_Generations(method, generations),
+            collector=_Generations(method, generations, run),
             total_frames=generations,
             frame_skip=1,
             optim_steps_per_batch=1,
@@ -147,9 +149,10 @@ class _Generations:
 
     init_random_frames = 0
 
-    def __init__(self, method: Method, generations: int) -> None:
+    def __init__(self, method: Method, generations: int, run: str | None) -> None:
         self.method = method
         self.generations = generations
+        self.run = run
 
     def __iter__(self) -> Iterator[TensorDict]:
         for _ in range(self.method.generation, self.generations):
@@ -159,10 +162,14 @@ class _Generations:
         """Nothing runs in the background."""
 
     def state_dict(self) -> dict[str, Any]:
-        return {}
+        return {"run": self.run or ""}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """``popl`` knows how far it is."""
+        """The method knows how far it is; whose it is must be compared."""
+        if state.get("run", "") != (self.run or ""):
+            raise CheckpointError(
+                f"it is of run {state.get('run') or 'unknown'}, not of {self.run or 'unknown'}"
+            )
 
 
 def _remove_unfinished(directory: Path) -> None:

@@ -3,10 +3,12 @@
 - From settings: ``builders`` makes what is learnt, ``data`` the segments and preferences
   (``asked`` keeps which groups gave them), ``label_data`` segments for people to compare, and
   ``evaluators`` the evaluator. Settings objects go no further than this package.
-- A run's folder: ``run_folder``, ``metrics``, ``loggers``, and its ``report``.
+- A run's folder: ``run_folder``, ``metrics``, ``loggers``, and its ``report``; ``run_manifest``,
+  ``run_sets`` and ``plug_ins`` tell whether what is in it belongs together.
 - A benchmark: ``suites`` reads what is compared, ``cells`` plans it and collects what came out,
   ``jobs`` runs it in processes, ``benchmark_tables`` and ``benchmark_report`` tell the results.
-- ``steps``: the steps of a training run, in their order; ``preflight``: what is looked at before it
+- ``steps``: the steps of a training run, in their order, of which ``run_start`` is the first;
+  ``preflight``: what is looked at before it
   has a folder; ``reevaluation`` of a finished one.
 - Real people: ``encoding`` of their texts, ``people`` who are held out, ``people_training``,
   ``people_steps`` of a run and its ``people_report``; ``delivery_study`` and ``argument_study``.

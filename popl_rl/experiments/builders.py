@@ -1,6 +1,6 @@
 """From settings to what is learnt and by what: hypotheses, clone, problem, method, baselines."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -179,6 +179,7 @@ def train_baselines(
     preferences: TensorDictBase,
     *,
     num_groups: int,
+    digests: Mapping[str, str] | None = None,
     generator: torch.Generator,
     progress: Callable[[int], None] | None = None,
 ) -> HypothesisSet:
@@ -190,6 +191,7 @@ def train_baselines(
         preferences: With the hidden groups, which oracles are told; the strict ones are the
             problem's comparisons.
         num_groups: Number of groups G.
+        digests: Of ``segments`` and ``preferences``: what is loaded must have been trained on them.
         generator: Source of initial weights and batches.
         progress: Called with the number of generations done.
 
@@ -201,7 +203,7 @@ def train_baselines(
             does not fit.
     """
     if config.baselines_from is not None:
-        return _load_baselines(config.baselines_from, problem, num_groups)
+        return _load_baselines(config.baselines_from, problem, num_groups, digests or {})
     if GROUP not in preferences.keys(True):
         raise ValueError(
             "the loaded preferences name no hidden groups, which the oracle needs; set "
@@ -212,9 +214,18 @@ def train_baselines(
     return train(GroupCPL(problem, weight=weight, generator=generator), progress=progress)
 
 
-def _load_baselines(path: str, problem: Problem, num_groups: int) -> HypothesisSet:
+def _load_baselines(
+    path: str, problem: Problem, num_groups: int, digests: Mapping[str, str]
+) -> HypothesisSet:
     loaded = load_set(path)
     check_baselines(loaded, path, problem.spec, num_groups)
+    known = loaded.provenance
+    others = [name for name in digests if known.get(name, digests[name]) != digests[name]]
+    if others:
+        raise ValueError(
+            f"evaluation.baselines_from: {path} was trained on other {' and '.join(others)}; name "
+            "a run on the same data"
+        )
     loaded.population.to(problem.device)
     return loaded
 

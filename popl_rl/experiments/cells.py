@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import OmegaConf
 
-from popl_rl.config import load_config
 from popl_rl.evaluation.suite import Suite
+from popl_rl.experiments.run_manifest import load_run_config
 from popl_rl.storage import write_atomic, write_json
 
 if TYPE_CHECKING:
@@ -207,7 +207,7 @@ def collect(suite: Suite, cells: Sequence[Cell], run_dir: Path) -> "pd.DataFrame
             continue
         folder = cell.folder(run_dir)
         rows = read_results(folder / "results.csv")
-        own = rows["method"] == str(OmegaConf.select(load_config(folder), "method.name"))
+        own = rows["method"] == str(OmegaConf.select(load_run_config(folder), "method.name"))
         if not cell.leads:
             rows, own = rows[own], own[own]
         rows = rows.assign(method=rows["method"].where(~own, cell.method))

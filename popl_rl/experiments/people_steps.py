@@ -22,6 +22,7 @@ from popl_rl.experiments.people import Fold, People, people_of, split
 from popl_rl.experiments.people_report import people_alarm, write_people_report
 from popl_rl.experiments.people_training import Trained, judge_fold, train_on
 from popl_rl.experiments.progress import Progress
+from popl_rl.experiments.run_manifest import check_own_data, run_id
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.storage import write_atomic
 
@@ -43,6 +44,7 @@ def read_people(config: Config, run_dir: Path) -> People:
     """
     kept = run_dir / "data"
     if kept.is_dir():
+        check_own_data(run_dir)
         data = read_folder(kept)
     else:
         with Progress("rows", total=None) as progress:
@@ -55,7 +57,7 @@ def read_people(config: Config, run_dir: Path) -> People:
     people = people_of(data, config.method)
     split(people, config.people, 0, ties=config.method.ties, seed=config.seed)  # before work starts
     if config.data.save and not kept.is_dir():
-        write_folder(data, kept)
+        write_folder(data, kept, about={"run": run_id(run_dir)})
     return people
 
 
@@ -79,6 +81,7 @@ def evolve_people(
                 checkpoint_dir=run_dir / "checkpoint",
                 checkpoint_interval=config.checkpoint_interval,
                 on_generation=on_generation,
+                run=run_id(run_dir),
             )
             metrics.truncate_to(trainer.resume())
             trainer.train()

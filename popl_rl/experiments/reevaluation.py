@@ -12,9 +12,11 @@ from popl_rl.experiments.data import build_groups, build_world, given_data, make
 from popl_rl.experiments.evaluators import make_evaluator
 from popl_rl.experiments.report import markdown
 from popl_rl.experiments.run_folder import save_config
+from popl_rl.experiments.run_manifest import check_own_data
+from popl_rl.experiments.run_sets import load_own_set
+from popl_rl.locks import locked
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.reward_set import RewardSet
-from popl_rl.models.sets import load_set
 from popl_rl.storage import write_atomic, written_beside
 
 __all__ = ["evaluate_again"]
@@ -37,14 +39,15 @@ def evaluate_again(config: Config, run_dir: Path, *, seed: int) -> tuple[Path, S
     """
     torch.set_num_threads(config.threads)
     is_reward = (run_dir / RewardSet.folder).is_dir()
-    found = load_set(run_dir / (RewardSet if is_reward else PolicySet).folder)
-    base_path, clone_path, kept = (run_dir / name for name in ("baselines", "clone", "data"))
-    baselines = None
-    if config.evaluation.baselines and base_path.is_dir():
-        baselines = load_set(base_path)
+    found = load_own_set(run_dir, (RewardSet if is_reward else PolicySet).folder)
+    kept, baselines = run_dir / "data", None
+    if config.evaluation.baselines and (run_dir / "baselines").is_dir():
+        baselines = load_own_set(run_dir, "baselines")
     world = build_world(config.env)
     groups = build_groups(config.raters, world)
     load, reader = (kept, None) if kept.is_dir() else given_data(config.data)
+    if kept.is_dir():
+        check_own_data(run_dir)
     data = make_data(
         config.data,
         config.raters,
@@ -56,22 +59,24 @@ def evaluate_again(config: Config, run_dir: Path, *, seed: int) -> tuple[Path, S
         reader=reader,
     )
     spec = build_spec(config.method, world.env)
-    clone = load_set(clone_path) if clone_path.is_dir() else None
+    clone = load_own_set(run_dir, "clone") if (run_dir / "clone").is_dir() else None
     evaluator = make_evaluator(config, world, groups, data, spec, clone=clone, seed=seed)
     board = evaluator.score(found, baselines, label=config.method.name)
-    number = 1 + len(list((run_dir / "evaluations").glob("[0-9]*")))
-    folder = run_dir / "evaluations" / f"{number:03d}"
     about = {
         "answers of each new rater": config.evaluation.answers,
         "seed": seed,
         **diagnostics(board, evaluator),
     }
-    title = f"Evaluation {number} of {run_dir.name}"
-    report = markdown(board.results, title=title, about=about, figures=[], label=board.label)
-    with written_beside(folder) as beside:
-        save_config(
-            beside, {"run_dir": str(run_dir), "evaluation": config.evaluation, "seed": seed}
-        )
-        write_atomic(beside / "results.csv", board.results.to_csv(index=False))
-        write_atomic(beside / "report.md", report)
+    # Another process may evaluate the same run.
+    with locked(run_dir / "evaluations"):
+        number = 1 + len(list((run_dir / "evaluations").glob("[0-9]*")))
+        folder = run_dir / "evaluations" / f"{number:03d}"
+        title = f"Evaluation {number} of {run_dir.name}"
+        report = markdown(board.results, title=title, about=about, figures=[], label=board.label)
+        with written_beside(folder) as beside:
+            save_config(
+                beside, {"run_dir": str(run_dir), "evaluation": config.evaluation, "seed": seed}
+            )
+            write_atomic(beside / "results.csv", board.results.to_csv(index=False))
+            write_atomic(beside / "report.md", report)
     return folder, board

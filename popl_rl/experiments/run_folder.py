@@ -7,12 +7,12 @@ are appended, and a torn last one is dropped when the file is opened again.
 
 import errno
 import importlib.metadata
-import json
 import platform
 import re
 import shlex
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -21,18 +21,26 @@ import torch
 from omegaconf import OmegaConf
 
 from popl_rl.experiments.loggers import RunLogger, make_logger
+from popl_rl.experiments.plug_ins import FOLDER
 from popl_rl.experiments.progress import Progress
-from popl_rl.storage import write_atomic, write_json, written_beside
+from popl_rl.locks import held
+from popl_rl.manifest import read_json
+from popl_rl.storage import MANIFEST, write_atomic, write_json, written_beside
 
 __all__ = [
     "Progress",
     "RunLogger",
+    "config_text",
     "create_run_dir",
     "git_state",
+    "in_use",
     "make_logger",
     "save_config",
     "write_metadata",
 ]
+
+LOCK = ".lock"
+"""File of a run folder that whoever works on the run holds."""
 
 _PACKAGES = (
     "popl_rl",
@@ -95,7 +103,7 @@ def create_run_dir(
                 continue
             return folder
         raise FileExistsError(f"{base} and 998 folders like it exist; choose run_dir=<dir>")
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+    if path.exists() and (not path.is_dir() or _holds_something(path)):
         raise FileExistsError(
             f"run_dir {path} exists and is not empty; choose another run_dir, or continue that run "
             f"with resume={path}"
@@ -108,11 +116,35 @@ def create_run_dir(
     return path
 
 
+def _holds_something(folder: Path) -> bool:
+    """Whether there is more than what a run that was killed at once has left."""
+    left = {LOCK} | ({MANIFEST, FOLDER} if not (folder / "config.yaml").exists() else set())
+    return any(
+        path.name not in left and not path.name.endswith(".tmp") for path in folder.iterdir()
+    )
+
+
 def save_config(run_dir: Path, cfg: Any) -> None:
     """Write ``config.yaml``: a DictConfig, dataclass or dict, with every reference resolved."""
+    write_atomic(run_dir / "config.yaml", config_text(cfg))
+
+
+def config_text(cfg: Any) -> str:
+    """What ``config.yaml`` says."""
     if not OmegaConf.is_config(cfg):
         cfg = OmegaConf.create(cfg)
-    write_atomic(run_dir / "config.yaml", OmegaConf.to_yaml(cfg, resolve=True))
+    return OmegaConf.to_yaml(cfg, resolve=True)
+
+
+@contextmanager
+def in_use(run_dir: Path) -> Iterator[None]:
+    """Be the only process that works on a run.
+
+    Raises:
+        HeldError: If another one, here or on another machine, is at it.
+    """
+    with held(run_dir / LOCK, what=f"{run_dir}, the folder of a run,"):
+        yield
 
 
 def write_metadata(run_dir: Path, *, command: Sequence[str]) -> None:
@@ -137,7 +169,7 @@ def write_metadata(run_dir: Path, *, command: Sequence[str]) -> None:
     }
     path = run_dir / "metadata.json"
     if path.exists():
-        first = json.loads(path.read_text(encoding="utf-8"))
+        first = read_json(path, cure="remove it; the run goes on without what it says")
         first.setdefault("resumed", []).append(entry)
         entry = first
     write_json(path, entry)

@@ -1,20 +1,16 @@
 """The steps of a training run, in the order in which ``trainers/train_popl.py`` takes them."""
 
-import logging
-import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-import torch
 from omegaconf import OmegaConf
 
 from popl_rl.algorithms.problem import Method, Problem
 from popl_rl.algorithms.reward_baselines import RewardBaselines, train_reward_baselines
 from popl_rl.algorithms.trainer import MethodTrainer
-from popl_rl.config import Config, changed, load_config, plain, validate
+from popl_rl.config import Config
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.data.environments import World, indexed, is_stateless
 from popl_rl.evaluation.diagnostics import diagnostics
@@ -32,14 +28,12 @@ from popl_rl.experiments.evaluators import make_evaluator
 from popl_rl.experiments.foresight import Foresight, last_training
 from popl_rl.experiments.loggers import RunLogger, make_logger
 from popl_rl.experiments.metrics import MetricsWriter, write_sizes
-from popl_rl.experiments.preflight import Place, check_infos, survey
+from popl_rl.experiments.preflight import Place, check_infos
 from popl_rl.experiments.progress import Progress
 from popl_rl.experiments.report import markdown
-from popl_rl.experiments.run_folder import (
-    create_run_dir,
-    save_config,
-    write_metadata,
-)
+from popl_rl.experiments.run_manifest import check_own_data, run_id
+from popl_rl.experiments.run_sets import save_anew
+from popl_rl.experiments.run_start import kept_unless_refused, open_run
 from popl_rl.keys import INFO
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.reward_functions import RewardSpec
@@ -62,7 +56,6 @@ __all__ = [
     "log_results",
     "open_logger",
     "open_run",
-    "save_anew",
     "train_references",
     "write_report",
 ]
@@ -100,79 +93,14 @@ class References:
     rewards: RewardBaselines | None
 
 
-def open_run(
-    config: Config, *, command: Sequence[str], given: Sequence[str] = ()
-) -> tuple[Config, Path, Place | None]:
-    """Make the folder of a run, or find the one to continue with its own settings.
-
-    Args:
-        config: Settings that were checked; of a run that is continued, where it is.
-        command: What was typed, for ``metadata.json``.
-        given: Overrides that were typed; of those beside ``resume=`` a run that is continued takes
-            the ones that ``popl_rl.config.CHANGEABLE`` allows.
-
-    Returns:
-        The settings, the folder, and where the run takes place; no place where people's answers are
-        learnt from without simulated raters.
-
-    Raises:
-        ValueError: If the settings of the run that is continued are off, or something that they
-            name cannot be found or does not go together.
-        OSError: If the folder exists already, or there is no run to resume.
-    """
-    is_new = config.resume is None
-    if config.resume is not None:
-        run_dir = create_run_dir(Path(config.resume), name="", resume=True)
-        stored: Any = OmegaConf.merge(OmegaConf.structured(Config), load_config(run_dir))
-        asked = OmegaConf.structured(config)
-        for name in changed(given):
-            OmegaConf.update(stored, name, OmegaConf.select(asked, name))
-        config = plain(stored)
-        validate(config)
-    logging.getLogger("torchrl").setLevel(logging.WARNING)  # TorchRL sets its own when imported
-    torch.set_num_threads(config.threads)
-    place = survey(config)
-    if not is_new:
-        write_metadata(run_dir, command=command)
-        return config, run_dir, place
-
-    def fill(folder: Path) -> None:
-        save_config(folder, config)
-        write_metadata(folder, command=command)
-
-    name = f"{config.method.name}-seed{config.seed}"
-    wanted = None if config.run_dir is None else Path(config.run_dir)
-    return config, create_run_dir(wanted, name=name, fill=fill), place
-
-
-@contextmanager
-def kept_unless_refused(run_dir: Path, *, is_new: bool) -> Iterator[None]:
-    """Remove a new run's folder if the block refuses what was asked for.
-
-    So that nothing stands in the way of the corrected command. A full disk or a kill is no refusal.
-
-    Args:
-        run_dir: Folder of the run.
-        is_new: Whether it began with this process; a run that is resumed keeps its folder.
-
-    Raises:
-        TypeError: What the block raises.
-        ValueError: Likewise.
-    """
-    try:
-        yield
-    except (TypeError, ValueError):
-        if is_new:
-            shutil.rmtree(run_dir, ignore_errors=True)
-        raise
-
-
 def gather(config: Config, run_dir: Path, place: Place) -> Setting:
     """Collect segments and ask the raters, or load what an earlier run collected."""
     world, groups = place.world, place.groups
     kept = run_dir / "data"
     has_kept = (kept / "preferences").is_dir()
     load, reader = (kept, None) if has_kept else given_data(config.data)
+    if has_kept:
+        check_own_data(run_dir)
     with Progress("segments", total=config.data.segments) as progress:
         data = make_data(
             config.data,
@@ -188,7 +116,7 @@ def gather(config: Config, run_dir: Path, place: Place) -> Setting:
     if load is None and world.collect is None:
         check_infos(config.env, map(str, data.steps[INFO].keys()))
     if config.data.save:
-        data.save(kept)
+        data.save(kept, about={"run": run_id(run_dir)})
     spec = build_spec(config.method, world.env)
     bank = spec.bank(indexed(data.steps, world.env.action_space)).to(config.device)
     comparisons = Comparisons.from_preferences(
@@ -209,7 +137,7 @@ def gather(config: Config, run_dir: Path, place: Place) -> Setting:
             )
         alone = StyledPopulation(clone, clone.typical().unsqueeze(0))
         typical = as_set(alone, alpha=config.method.training.alpha)
-        save_anew(typical, run_dir / "clone")
+        save_anew(typical, run_dir / "clone", run_dir, digests=data.digests)
     comparisons = comparisons.to(config.device)
     problem = build_problem(config.method, spec, bank, comparisons, clone=clone)
     evaluator = make_evaluator(config, world, groups, data, spec, clone=typical, seed=config.seed)
@@ -255,6 +183,7 @@ def evolve(
             checkpoint_dir=run_dir / "checkpoint",
             checkpoint_interval=config.checkpoint_interval,
             on_generation=on_generation,
+            run=run_id(run_dir),
         )
         done = trainer.resume()
         metrics.truncate_to(done)
@@ -265,7 +194,7 @@ def evolve(
             method.progress = progress.update
         found = method.result()
     found.fair_member = found.fair_among(setting.problem.bank, setting.problem.comparisons)
-    save_anew(found, run_dir / found.folder)
+    save_anew(found, run_dir / found.folder, run_dir, digests=setting.data.digests)
     write_sizes(method, run_dir / "sizes.csv")
     return found
 
@@ -281,10 +210,11 @@ def train_references(config: Config, setting: Setting, run_dir: Path) -> Referen
                 problem,
                 setting.data.preferences,
                 num_groups=len(setting.groups),
+                digests=setting.data.digests,
                 generator=stream(config.seed, "baselines", config.device),
                 progress=progress.update,
             )
-        save_anew(baselines, run_dir / "baselines")
+        save_anew(baselines, run_dir / "baselines", run_dir, digests=setting.data.digests)
     if options.reward_baselines and is_stateless(setting.world.env):
         rewards = train_reward_baselines(
             cast("RewardSpec", problem.spec),
@@ -382,9 +312,3 @@ def write_report(
         label=board.label,
     )
     write_atomic(run_dir / "report.md", text)
-
-
-def save_anew(found: HypothesisSet, path: Path) -> None:
-    """Save a set in the place of what a killed run may have left."""
-    shutil.rmtree(path, ignore_errors=True)
-    found.save(path)

@@ -91,9 +91,12 @@ def test_beside_resume_only_what_changes_no_result():
 
 def test_a_resumed_run_takes_what_may_change_and_keeps_the_rest(config_of, tiny, tmp_path):
     first = plain(config_of(*tiny, f"run_dir={tmp_path / 'run'}", "seed=3", "threads=1"))
-    open_run(first, command=["popl-train"])
+    with open_run(first, command=["popl-train"]):
+        pass
     typed = [f"resume={tmp_path / 'run'}", "checkpoint_interval=4"]
-    config, run_dir, _ = open_run(plain(config_of(*typed)), command=["popl-train"], given=typed)
+    again = plain(config_of(*typed))
+    with open_run(again, command=["popl-train"], given=typed) as (config, run_dir, _):
+        pass
     assert run_dir == tmp_path / "run"
     assert config.checkpoint_interval == 4
     assert config.seed == 3

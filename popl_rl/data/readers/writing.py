@@ -1,7 +1,8 @@
 """Preferences as other programs read them: our folder, csv, npz. Rater ids are always kept."""
 
-import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -26,15 +27,21 @@ from popl_rl.keys import (
     RATER,
     REWARD,
 )
-from popl_rl.storage import save_tensordict, written_beside
+from popl_rl.manifest import read_sealed, sealed
+from popl_rl.storage import read_manifest, save_tensordict, write_json, written_beside
 
 __all__ = ["read_folder", "write_csv", "write_folder", "write_npz"]
 
 _NAMES = "names.json"
 
 
-def write_folder(data: Imported, path: Path) -> None:
+def write_folder(data: Imported, path: Path, *, about: Mapping[str, Any] | None = None) -> None:
     """Write a folder that ``data.load=`` reads: segments, preferences and ``names.json``.
+
+    Args:
+        data: What to write.
+        path: The folder to be.
+        about: What else the preferences' manifest says, such as the id of a run.
 
     Raises:
         FileExistsError: If ``path`` exists.
@@ -42,10 +49,10 @@ def write_folder(data: Imported, path: Path) -> None:
     with written_beside(path) as beside:
         save_tensordict(data.segments, beside / "segments")
         digest = segments_digest(beside / "segments", data.segments)
-        save_preferences(data.preferences, beside / "preferences", segments=digest)
-        (beside / _NAMES).write_text(
-            json.dumps(data.names._asdict(), ensure_ascii=False), encoding="utf-8"
-        )
+        names = sealed(data.names._asdict())
+        kept = {**(about or {}), "names": names["seal"]}
+        save_preferences(data.preferences, beside / "preferences", segments=digest, about=kept)
+        write_json(beside / _NAMES, names)
 
 
 def read_folder(path: Path) -> Imported:
@@ -62,16 +69,27 @@ def read_folder(path: Path) -> Imported:
         segments=segments_digest(path / "segments", segments),
         named=False,
     )
-    names = Names()
-    if (path / _NAMES).is_file():
-        try:
-            names = Names(**json.loads((path / _NAMES).read_text(encoding="utf-8")))
-        except (ValueError, TypeError) as error:
-            raise ValueError(
-                f"{path / _NAMES} is not readable as names of items, raters and conditions "
-                f"({error}); import the data again"
-            ) from error
-    return Imported(segments, preferences, names)
+    return Imported(segments, preferences, _read_names(path))
+
+
+def _read_names(path: Path) -> Names:
+    """Names of items, raters and conditions, if there are any."""
+    manifest = read_manifest(path / "preferences")
+    kept = None if manifest is None else manifest["about"].get("names")
+    cure = "import the data again"
+    if kept is None and not (path / _NAMES).is_file():
+        return Names()
+    try:
+        told = read_sealed(path / _NAMES, cure=cure)
+        told.pop("seal", None)  # of an earlier version
+        if kept not in (None, sealed(told)["seal"]):
+            raise ValueError("they are those of other preferences")
+        return Names(**told)
+    except (OSError, ValueError, TypeError) as error:
+        raise ValueError(
+            f"{path / _NAMES} is not readable as names of items, raters and conditions "
+            f"({error}); {cure}"
+        ) from error
 
 
 def write_csv(data: Imported, path: Path) -> None:
