@@ -2,12 +2,11 @@
 
 import contextlib
 import copy
-import fcntl
 import logging
 import shutil
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,9 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from popl_rl.config import plain, validate
-from popl_rl.experiments.cells import Cell, is_finished
+from popl_rl.experiments.cells import Cell, is_finished, results_digest
+from popl_rl.locks import HeldError, locked
+from popl_rl.manifest import sealed
 from popl_rl.storage import write_json
 from popl_rl.trainers import train_popl
 from popl_rl.trainers.command import USER_ERRORS
@@ -64,7 +65,8 @@ def run_task(task: Task) -> str | None:
     log = task.run_dir / "logs" / f"{task.cell.name}.txt"
     log.parent.mkdir(parents=True, exist_ok=True)
     problem = None
-    with _alone(log.with_suffix(".lock")):
+    # Killed processes hold no lock, even on another machine.
+    with locked(log):
         with (
             log.open("w", encoding="utf-8") as file,
             contextlib.redirect_stdout(file),
@@ -92,14 +94,6 @@ def compose_train(overrides: Sequence[str]) -> Any:
         return compose("train", overrides=given)
 
 
-@contextlib.contextmanager
-def _alone(path: Path) -> Iterator[None]:
-    """Wait until no other process has this lock, even on another machine; killed ones have none."""
-    with path.open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
-
-
 def _train(task: Task) -> None:
     cell, folder = task.cell, task.cell.folder(task.run_dir)
     config = copy.deepcopy(task.config)
@@ -118,7 +112,8 @@ def _train(task: Task) -> None:
         train_popl.run(config)
         seconds = round(time.perf_counter() - started, 2)
     # Last, as a sign that the cell is finished.
-    write_json(folder / "cell.json", {**cell.record(), "seconds": seconds})
+    record = {**cell.record(), "seconds": seconds, "results": results_digest(folder)}
+    write_json(folder / "cell.json", sealed(record))
 
 
 def _resume(config: Any, folder: Path) -> bool:
@@ -131,6 +126,8 @@ def _resume(config: Any, folder: Path) -> bool:
     again.resume = str(folder)
     try:
         train_popl.run(again)
+    except HeldError:
+        raise  # another process is at it, and what it has done is not to be removed
     except Exception:
         traceback.print_exc()
         return False

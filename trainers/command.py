@@ -4,7 +4,9 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -26,6 +28,7 @@ from popl_rl.config import (
     unread,
     validate,
 )
+from popl_rl.interruption import Terminated, listening
 from popl_rl.trainers.spelling import explained
 from popl_rl.trainers.terminal import steady_terminal
 from popl_rl.trainers.typed import as_typed, opened
@@ -58,7 +61,8 @@ def run_command(main: Callable[[], Any], schema: type = Config) -> None:
     """Run a Hydra main function and leave with the right exit code.
 
     0 when it worked, 2 when the user can put it right (bad option, file or value), 130 after
-    Ctrl-C, 1 for a defect of ours. ``HYDRA_FULL_ERROR=1`` shows the traceback of user errors too.
+    Ctrl-C, 143 after SIGTERM, 1 for a defect of ours. ``HYDRA_FULL_ERROR=1`` shows the traceback
+    of user errors too.
 
     Args:
         main: The function.
@@ -78,15 +82,30 @@ def _run(main: Callable[[], Any], schema: type) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
         sys.argv[1:] = as_typed(sys.argv[1:], schema)
-        main()
-    except KeyboardInterrupt:
-        _print_error("\ninterrupted; continue with resume=<folder of the run>")
-        sys.exit(130)
+        with listening():
+            main()
+        _forget_sweep()
+    except (KeyboardInterrupt, Terminated) as stop:
+        word, code = ("terminated", 143) if isinstance(stop, Terminated) else ("interrupted", 130)
+        cure = next(iter(getattr(stop, "__notes__", [])), "the same command begins anew")
+        _print_error(f"\n{word}; {cure}")
+        sys.exit(code)
     except USER_ERRORS as error:
         _print_error(f"error: {explained(error, schema)}")
         sys.exit(2)
     finally:
         del os.environ["HYDRA_FULL_ERROR"]
+
+
+def _forget_sweep() -> None:
+    """Remove the copy of its settings that Hydra leaves of a sweep: each run has its own."""
+    folder = Path("runs", ".sweep")
+    if not folder.is_dir():
+        return
+    (folder / "multirun.yaml").unlink(missing_ok=True)
+    for empty in (folder, folder.parent):
+        with suppress(OSError):  # a launcher's logs, or runs
+            empty.rmdir()
 
 
 def prepare(config: Any, given: Sequence[str] | None = None) -> Config:

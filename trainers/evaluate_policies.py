@@ -18,6 +18,7 @@ from omegaconf import OmegaConf
 
 from popl_rl.config import Checker, Config, EvaluateConfig, validate
 from popl_rl.experiments.run_manifest import load_run_config
+from popl_rl.interruption import importing
 from popl_rl.trainers.command import register_schemas, run_command
 
 if TYPE_CHECKING:
@@ -34,7 +35,8 @@ def run(config: EvaluateConfig) -> tuple[Path, "Scoreboard"]:
     stored = _settings(config, run_dir, has_data=(run_dir / "data").is_dir())
     seed = stored.seed + 1 if config.seed is None else config.seed
     # Imported late, so that a wrong setting is told at once.
-    from popl_rl.experiments.reevaluation import evaluate_again
+    with importing():
+        from popl_rl.experiments.reevaluation import evaluate_again
 
     return evaluate_again(stored, run_dir, seed=seed)
 

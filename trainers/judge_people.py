@@ -18,6 +18,7 @@ import hydra
 
 from popl_rl.accessories import accessory
 from popl_rl.config import Config
+from popl_rl.interruption import importing
 from popl_rl.trainers.command import given_overrides, prepare, register_schemas, run_command
 
 if TYPE_CHECKING:
@@ -43,7 +44,8 @@ def run(config: Config) -> Result:
     """Compare methods on all folds, or go on where a killed comparison was stopped."""
     config = prepare(config)
     # Imported late, so that a wrong setting is told at once.
-    from popl_rl.experiments import people_steps, steps
+    with importing():
+        from popl_rl.experiments import people_steps, steps
 
     opened = steps.open_run(config, command=sys.argv, given=given_overrides())
     with opened as (config, run_dir, _):

@@ -23,6 +23,7 @@ from popl_rl.evaluation.suite import Suite
 from popl_rl.experiments.cells import Cell, claim, collect, is_finished, plan
 from popl_rl.experiments.jobs import Job, run_jobs
 from popl_rl.experiments.suites import load_suite
+from popl_rl.interruption import Terminated, importing
 from popl_rl.trainers.benchmark_cells import make_tasks, run_task
 from popl_rl.trainers.command import register_schemas, run_command
 
@@ -66,8 +67,9 @@ def run(config: BenchmarkConfig) -> Result:
     unfinished = [cell for cell in wanted if not is_finished(cell, run_dir)]
     tasks = make_tasks(unfinished, run_dir)
     # Imported late, so that a wrong setting is told at once.
-    from popl_rl.experiments.benchmark_report import write_report
-    from popl_rl.experiments.progress import Progress
+    with importing():
+        from popl_rl.experiments.benchmark_report import write_report
+        from popl_rl.experiments.progress import Progress
 
     # 2. Doing it.
     jobs = [Job(t.cell.name, t, t.cell.source.name if t.cell.source else None) for t in tasks]
@@ -141,9 +143,9 @@ def main(cfg: Any) -> None:
     """Hydra's entry."""
     try:
         result = run(cfg)
-    except KeyboardInterrupt:
-        Console(stderr=True).print("\ninterrupted; the same command goes on where this stopped")
-        sys.exit(130)
+    except (KeyboardInterrupt, Terminated) as stop:
+        stop.__notes__ = ["the same command goes on where this stopped"]
+        raise
     show(result)
     if result.failures:
         listed = "\n  ".join(f"{cell}: {error}" for cell, error in result.failures.items())

@@ -11,7 +11,7 @@ and shows what the set is worth to every hidden group beside pooled CPL and the 
 """
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,8 @@ import hydra
 
 from popl_rl.accessories import accessory
 from popl_rl.config import Config
+from popl_rl.experiments.run_manifest import is_run_of
+from popl_rl.interruption import importing
 from popl_rl.trainers.command import given_overrides, prepare, register_schemas, run_command
 
 if TYPE_CHECKING:
@@ -45,9 +47,12 @@ class Result:
 def run(config: Config) -> Result:
     """Train, or go on where a killed run was stopped."""
     config = prepare(config)
+    if _is_of_sweep(config):
+        config = replace(config, resume=config.run_dir)
     is_new = config.resume is None
     # Imported late, so that a wrong setting is told at once.
-    from popl_rl.experiments import steps
+    with importing():
+        from popl_rl.experiments import steps
 
     opened = steps.open_run(config, command=sys.argv, given=given_overrides())
     with opened as (config, run_dir, place):
@@ -113,6 +118,18 @@ def _run_people(config: Config, run_dir: Path) -> Result:
     return Result(run_dir, trained.found, Scoreboard(results, {}, {}, config.method.name))
 
 
+def _is_of_sweep(config: Config) -> bool:
+    """Whether this is a run of a sweep that was begun by a sweep before, which was killed."""
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+
+    is_sweep = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+    if not is_sweep or config.run_dir is None or config.resume is not None:
+        return False
+    run_dir = Path(config.run_dir)
+    return (run_dir / "config.yaml").is_file() and is_run_of(run_dir, config)
+
+
 def show(result: Result) -> None:
     """Print the table and where everything is."""
     from rich.console import Console
@@ -142,6 +159,11 @@ register_schemas()
 def main(cfg: Any) -> None:
     """Hydra's entry."""
     config = prepare(cfg)
+    if _is_of_sweep(config):
+        run_dir = Path(str(config.run_dir))
+        if (run_dir / "report.md").is_file():
+            print(f"{run_dir} is finished, and left as it is")
+            return
     method = config.method.name
     env = config.env.factory if config.raters.groups else str(config.data.load)
     # Loading PyTorch takes seconds, in which a person should know that something goes on.

@@ -9,14 +9,17 @@ everything that has a state in one checkpoint.
 import re
 import shutil
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation, GlobalRNGState
 
 from popl_rl.algorithms.problem import Method
+from popl_rl.interruption import Terminated, is_asked_to_end, putting_off
+from popl_rl.storage import explaining_full_disk, reserve
 
 with warnings.catch_warnings():
     # TorchRL 0.14 deprecates a base class that it still derives from, and says so when imported.
@@ -24,6 +27,8 @@ with warnings.catch_warnings():
     from torchrl.trainers import OptimizationStepper, Trainer
 
 __all__ = ["MethodTrainer"]
+
+_MARGIN = 1 << 20  # bytes of a checkpoint besides its tensors: JSON, names, the state of the loop
 
 
 class MethodTrainer(Trainer):
@@ -88,6 +93,29 @@ class MethodTrainer(Trainer):
         self.method = method
         self.collected_frames = method.generation
 
+    def train(self) -> None:
+        """Run the generations that are left.
+
+        Raises:
+            Terminated: After SIGTERM, once the generation at hand is done and its checkpoint
+                written.
+            OSError: If there is no room for a checkpoint; the earlier ones are kept.
+        """
+        with putting_off():
+            super().train()
+        if is_asked_to_end():
+            raise Terminated
+
+    def _save_trainer(self) -> None:
+        """Write a checkpoint, if there is room: a memory map that fails ends the process."""
+        directory = self.checkpoint_rotation.directory
+        directory.mkdir(parents=True, exist_ok=True)
+        # Tensors are written once by themselves and once more into the archive.
+        need = 2 * _bytes_in(self.method.state_dict()) + _MARGIN
+        with explaining_full_disk(directory / "checkpoint", need=need):
+            reserve(directory, need)
+            super()._save_trainer()
+
     def resume(self) -> int:
         """Continue from the newest checkpoint that can be read.
 
@@ -141,6 +169,8 @@ class _Step(OptimizationStepper):
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
         metrics = self.method.step()
         self.on_generation(self.method.generation, metrics)
+        if is_asked_to_end():
+            trainer.request_stop("SIGTERM")
         return TensorDict(metrics)
 
 
@@ -170,6 +200,15 @@ class _Generations:
             raise CheckpointError(
                 f"it is of run {state.get('run') or 'unknown'}, not of {self.run or 'unknown'}"
             )
+
+
+def _bytes_in(state: Any) -> int:
+    """Bytes of all tensors in a nested state."""
+    if isinstance(state, Tensor):
+        return state.numel() * state.element_size()
+    if isinstance(state, Mapping | TensorDictBase):
+        return sum(_bytes_in(value) for value in state.values())
+    return sum(map(_bytes_in, state)) if isinstance(state, list | tuple) else 0
 
 
 def _remove_unfinished(directory: Path) -> None:

@@ -1,5 +1,6 @@
 """Statistics over groups and seeds: headline measure, worst group, mean and 95 % interval."""
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -41,8 +42,19 @@ def read_results(path: Path) -> pd.DataFrame:
 
     Returns:
         Its rows; an empty choice is an empty string, not NaN.
+
+    Raises:
+        ValueError: If it is cut off, or no such table.
     """
-    table = pd.read_csv(path, dtype={"choice": "str"})
+    cure = "finish the run again with resume=<its folder>, or restore the file"
+    try:
+        text = path.read_text(encoding="utf-8")
+        table = pd.read_csv(io.StringIO(text), dtype={"choice": "str"})
+        missing = {"method", "measure", "value"} - set(table)
+        if missing or not text.endswith("\n") or not pd.api.types.is_numeric_dtype(table["value"]):
+            raise ValueError("it is cut off, or lacks columns")
+    except (ValueError, pd.errors.ParserError) as error:
+        raise ValueError(f"{path} is no whole table of results ({error}); {cure}") from error
     # pandas reads empty text as NaN, which equals nothing and is left out of groups.
     return table.fillna({"choice": ""}) if "choice" in table else table
 

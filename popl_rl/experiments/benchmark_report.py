@@ -1,7 +1,6 @@
 """What came out of a benchmark, as ``results.csv``, a report in Markdown, and pictures."""
 
 import contextlib
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from popl_rl.experiments.benchmark_tables import (
 )
 from popl_rl.experiments.cells import Cell, is_finished
 from popl_rl.experiments.markdown import markdown_table
+from popl_rl.manifest import read_json
 from popl_rl.plotting.benchmark_curves import catering_curves, recovery_along_axes, scenario_dots
 from popl_rl.plotting.benchmark_plots import scenario_bars, sweep_panels
 from popl_rl.plotting.style import save
@@ -106,7 +106,7 @@ def write_report(
 
 def _code_of(folder: Path) -> str:
     """What a cell was run with: the version, and the commit if it is known."""
-    data = json.loads((folder / "metadata.json").read_text(encoding="utf-8"))
+    data = read_json(folder / "metadata.json", cure="run the cell again")
     git = data["git"]
     commit = "" if git is None else f" {git['commit'][:7]}{' and changes' * git['dirty']}"
     return f"popl_rl {data['versions']['popl_rl']}{commit}"

@@ -6,7 +6,7 @@ scenario and seed see the same data, which the first of them makes.
 
 import csv
 import io
-import json
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,12 +16,13 @@ from omegaconf import OmegaConf
 
 from popl_rl.evaluation.suite import Suite
 from popl_rl.experiments.run_manifest import load_run_config
+from popl_rl.manifest import digest_of_bytes, read_json, read_sealed
 from popl_rl.storage import write_atomic, write_json
 
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["COLUMNS", "Cell", "claim", "collect", "is_finished", "plan"]
+__all__ = ["COLUMNS", "Cell", "claim", "collect", "is_finished", "plan", "results_digest"]
 
 COLUMNS = ["suite", "scenario", "seed", "method", "choice", "group", "measure", "value"]
 """Columns of a benchmark's ``results.csv``."""
@@ -122,7 +123,9 @@ def claim(run_dir: Path, suite: Suite, cells: Sequence[Cell]) -> None:
     run_dir.mkdir(parents=True, exist_ok=True)
     kept = run_dir / "benchmark.json"
     if kept.is_file():
-        other = json.loads(kept.read_text(encoding="utf-8"))["suite"]
+        cure = f"remove it if {run_dir} is of suite {suite.name!r}, or choose another run_dir"
+        about = read_json(kept, cure=cure)
+        other = about.get("suite") if isinstance(about, dict) else about
         if other != suite.name:
             raise ValueError(
                 f"run_dir {run_dir} holds suite {other!r}, not {suite.name!r}; choose another "
@@ -143,7 +146,9 @@ def claim(run_dir: Path, suite: Suite, cells: Sequence[Cell]) -> None:
 
 
 def is_finished(cell: Cell, run_dir: Path) -> bool:
-    """Whether a cell has been run to its end.
+    """Whether a cell has been run to its end, and what it found is whole.
+
+    One whose record or results are damaged is not, which is told: it is run again.
 
     Args:
         cell: The cell.
@@ -156,7 +161,14 @@ def is_finished(cell: Cell, run_dir: Path) -> bool:
     record = folder / "cell.json"
     if not record.is_file() or not (folder / "results.csv").is_file():
         return False
-    stored, wanted = json.loads(record.read_text(encoding="utf-8")), cell.record()
+    try:
+        stored = read_sealed(record, cure="the cell is run again")
+        if stored.get("results") not in (None, results_digest(folder)):
+            raise ValueError(f"{folder / 'results.csv'} is not what it was; the cell is run again")
+    except ValueError as error:
+        warnings.warn(str(error), stacklevel=2)
+        return False
+    wanted = cell.record()
     changes = [
         f"{key} was {_without(stored.get(key), value)} and is {_without(value, stored.get(key))}"
         for key, value in wanted.items()
@@ -168,6 +180,11 @@ def is_finished(cell: Cell, run_dir: Path) -> bool:
             "to run it again, or choose another run_dir"
         )
     return True
+
+
+def results_digest(folder: Path) -> str:
+    """Digest of the results of a cell, which its record keeps."""
+    return digest_of_bytes((folder / "results.csv").read_bytes())
 
 
 def _without(one: Any, other: Any) -> Any:
@@ -206,12 +223,17 @@ def collect(suite: Suite, cells: Sequence[Cell], run_dir: Path) -> "pd.DataFrame
         if not is_finished(cell, run_dir):
             continue
         folder = cell.folder(run_dir)
-        rows = read_results(folder / "results.csv")
-        own = rows["method"] == str(OmegaConf.select(load_run_config(folder), "method.name"))
+        try:
+            rows = read_results(folder / "results.csv")
+            trained = str(OmegaConf.select(load_run_config(folder), "method.name"))
+        except (OSError, ValueError) as error:
+            warnings.warn(f"cell {cell.name} is left out: {error}", stacklevel=2)
+            continue
+        own = rows["method"] == trained
         if not cell.leads:
             rows, own = rows[own], own[own]
         rows = rows.assign(method=rows["method"].where(~own, cell.method))
-        seconds = json.loads((folder / "cell.json").read_text(encoding="utf-8"))["seconds"]
+        seconds = read_sealed(folder / "cell.json", cure="run the cell again")["seconds"]
         if seconds is not None:
             timed = [(cell.method, "", "all", "seconds", seconds)]
             rows = pd.concat([rows, pd.DataFrame(timed, columns=list(rows))], ignore_index=True)

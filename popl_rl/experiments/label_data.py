@@ -1,6 +1,5 @@
 """Segments for people to compare: copied, read, or collected first."""
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import cast
 
 from popl_rl.config import DataConfig, EnvConfig, load_config
 from popl_rl.experiments.data import Reader, build_world, first_segments
+from popl_rl.manifest import read_json
 from popl_rl.registry import resolve
 from popl_rl.storage import save_tensordict, write_json, written_beside
 
@@ -41,7 +41,7 @@ def gather_segments(
     """
     about = folder / "label.json"
     if about.is_file():
-        return int(json.loads(about.read_text(encoding="utf-8"))["seed"])
+        return int(read_json(about, cure="move the folder away, or restore the file")["seed"])
     folder.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(folder / "segments", ignore_errors=True)  # left by a killed process
     seed = seed if config.seed is None else config.seed

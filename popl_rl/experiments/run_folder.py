@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import OmegaConf
 
 from popl_rl.experiments.loggers import RunLogger, make_logger
 from popl_rl.experiments.plug_ins import FOLDER
 from popl_rl.experiments.progress import Progress
+from popl_rl.experiments.run_manifest import config_text
 from popl_rl.locks import held
 from popl_rl.manifest import read_json
 from popl_rl.storage import MANIFEST, write_atomic, write_json, written_beside
@@ -30,7 +30,6 @@ from popl_rl.storage import MANIFEST, write_atomic, write_json, written_beside
 __all__ = [
     "Progress",
     "RunLogger",
-    "config_text",
     "create_run_dir",
     "git_state",
     "in_use",
@@ -127,13 +126,6 @@ def _holds_something(folder: Path) -> bool:
 def save_config(run_dir: Path, cfg: Any) -> None:
     """Write ``config.yaml``: a DictConfig, dataclass or dict, with every reference resolved."""
     write_atomic(run_dir / "config.yaml", config_text(cfg))
-
-
-def config_text(cfg: Any) -> str:
-    """What ``config.yaml`` says."""
-    if not OmegaConf.is_config(cfg):
-        cfg = OmegaConf.create(cfg)
-    return OmegaConf.to_yaml(cfg, resolve=True)
 
 
 @contextmanager

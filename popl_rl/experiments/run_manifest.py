@@ -10,25 +10,53 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from popl_rl.config import load_config
 from popl_rl.experiments.plug_ins import find_plug_ins, keep_plug_ins
 from popl_rl.manifest import digest_of_bytes, read_sealed, sealed
 from popl_rl.storage import MANIFEST, read_manifest, write_json
 
-__all__ = ["check_own", "check_own_data", "load_run_config", "run_id", "write_run_manifest"]
+__all__ = [
+    "check_own",
+    "check_own_data",
+    "config_text",
+    "is_run_of",
+    "load_run_config",
+    "run_id",
+    "write_run_manifest",
+]
 
 _FORMAT = "popl_rl.run/1"
 
 
-def write_run_manifest(run_dir: Path, config: Any, text: str) -> None:
+def config_text(config: Any) -> str:
+    """What ``config.yaml`` says of a DictConfig, dataclass or dict, with references resolved."""
+    if not OmegaConf.is_config(config):
+        config = OmegaConf.create(config)
+    return OmegaConf.to_yaml(config, resolve=True)
+
+
+def is_run_of(run_dir: Path, config: Any) -> bool:
+    """Whether a folder is that of a run which was started with these very settings.
+
+    Raises:
+        ValueError: If its manifest is damaged or was changed.
+    """
+    content = _read(run_dir)
+    return content is not None and content["config"] == _digest(config)
+
+
+def _digest(config: Any) -> str:
+    return digest_of_bytes(config_text(config).encode())
+
+
+def write_run_manifest(run_dir: Path, config: Any) -> None:
     """Give a new run an id, and keep its plug-ins.
 
     Args:
         run_dir: Folder of the run.
-        config: Its settings.
-        text: What ``config.yaml`` is going to say.
+        config: Its settings, as ``config.yaml`` is going to say them.
 
     Raises:
         OSError: If it cannot be written.
@@ -36,7 +64,7 @@ def write_run_manifest(run_dir: Path, config: Any, text: str) -> None:
     content = {
         "format": _FORMAT,
         "run": uuid.uuid4().hex,
-        "config": digest_of_bytes(text.encode()),
+        "config": _digest(config),
         "plug_ins": keep_plug_ins(run_dir, config),
     }
     write_json(run_dir / MANIFEST, sealed(content))

@@ -1,6 +1,7 @@
 """How a run begins: everything is looked at, then the folder appears with its first content."""
 
 import logging
+import shlex
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -13,13 +14,13 @@ from omegaconf import OmegaConf
 from popl_rl.config import Config, changed, plain, validate
 from popl_rl.experiments.preflight import Place, survey
 from popl_rl.experiments.run_folder import (
-    config_text,
     create_run_dir,
     in_use,
     save_config,
     write_metadata,
 )
 from popl_rl.experiments.run_manifest import load_run_config, write_run_manifest
+from popl_rl.interruption import Terminated
 
 __all__ = ["kept_unless_refused", "open_run"]
 
@@ -48,7 +49,7 @@ def open_run(
     """
     if config.resume is not None:
         run_dir = create_run_dir(Path(config.resume), name="", resume=True)
-        with in_use(run_dir):
+        with in_use(run_dir), _saying_how_to_go_on(run_dir, command):
             config = _continued(config, run_dir, given)
             place = _prepared(config)
             write_metadata(run_dir, command=command)
@@ -57,15 +58,27 @@ def open_run(
     place = _prepared(config)
 
     def fill(folder: Path) -> None:
-        write_run_manifest(folder, config, config_text(config))
+        write_run_manifest(folder, config)
         save_config(folder, config)
         write_metadata(folder, command=command)
 
     name = f"{config.method.name}-seed{config.seed}"
     wanted = None if config.run_dir is None else Path(config.run_dir)
     run_dir = create_run_dir(wanted, name=name, fill=fill)
-    with in_use(run_dir):
+    with in_use(run_dir), _saying_how_to_go_on(run_dir, command):
         yield config, run_dir, place
+
+
+@contextmanager
+def _saying_how_to_go_on(run_dir: Path, command: Sequence[str]) -> Iterator[None]:
+    """Note at Ctrl-C and SIGTERM which command goes on with the run."""
+    try:
+        yield
+    except (KeyboardInterrupt, Terminated) as stop:
+        name = Path(command[0]).name if command else ""
+        program = name if name.startswith("popl-") else "popl-train"
+        stop.add_note(f"continue with: {program} resume={shlex.quote(str(run_dir))}")
+        raise
 
 
 def _continued(config: Config, run_dir: Path, given: Sequence[str]) -> Config:

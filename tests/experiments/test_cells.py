@@ -4,8 +4,10 @@ import pandas as pd
 import pytest
 
 from popl_rl.evaluation.statistics import RESULT_COLUMNS, worst
-from popl_rl.experiments.cells import COLUMNS, claim, collect, is_finished, plan
+from popl_rl.experiments.cells import COLUMNS, claim, collect, is_finished, plan, results_digest
 from popl_rl.experiments.suites import parse_suite
+from popl_rl.manifest import sealed
+from popl_rl.storage import write_json
 
 SUITE = parse_suite(
     "sweep",
@@ -91,6 +93,40 @@ def test_a_cell_is_finished_when_both_its_files_are_there(tmp_path):
         path.unlink()
         assert not is_finished(cell, tmp_path)
         path.write_text(content)
+
+
+def cut(text):
+    return text[:-9]
+
+
+def without_a_row(text):
+    return "".join(text.splitlines(keepends=True)[:-1])
+
+
+def another_number(text):
+    return text.replace("1.5", "1.6").replace("0.8", "0.9")
+
+
+@pytest.mark.parametrize("file", ["cell.json", "results.csv"])
+@pytest.mark.parametrize("damage", [cut, without_a_row, another_number, lambda _: ""])
+def test_a_cell_whose_record_or_results_are_damaged_is_not_finished(tmp_path, file, damage):
+    cell = plan(SUITE, seeds=1)[0]
+    finish(cell, tmp_path, found(0.9))
+    folder = cell.folder(tmp_path)
+    record = {**cell.record(), "seconds": 1.5, "results": results_digest(folder)}
+    write_json(folder / "cell.json", sealed(record))
+    assert is_finished(cell, tmp_path)
+    (folder / file).write_text(damage((folder / file).read_text()))
+    with pytest.warns(UserWarning, match="the cell is run again"):
+        assert collect(SUITE, [cell], tmp_path).empty
+
+
+def test_a_damaged_benchmark_json_is_named_with_a_cure(tmp_path):
+    cells = plan(SUITE, seeds=1)
+    claim(tmp_path, SUITE, cells)
+    (tmp_path / "benchmark.json").write_text("{")
+    with pytest.raises(ValueError, match=r"benchmark\.json is damaged.*remove it if .* of suite"):
+        claim(tmp_path, SUITE, cells)
 
 
 def test_a_cell_that_was_run_as_something_else_is_an_error(tmp_path):

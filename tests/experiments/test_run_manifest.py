@@ -7,10 +7,12 @@ import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 
-from popl_rl.experiments.run_folder import config_text, create_run_dir, save_config
+from popl_rl.experiments.run_folder import create_run_dir, save_config
 from popl_rl.experiments.run_manifest import (
     check_own,
     check_own_data,
+    config_text,
+    is_run_of,
     load_run_config,
     run_id,
     write_run_manifest,
@@ -43,7 +45,7 @@ CONFIG = {"seed": 3, "raters": {"groups": ["raters_of_mine.py:likes(3)", "upper"
 
 def begin(run_dir, config=CONFIG):
     run_dir.mkdir()
-    write_run_manifest(run_dir, config, config_text(config))
+    write_run_manifest(run_dir, config)
     save_config(run_dir, config)
     return run_dir
 
@@ -52,6 +54,9 @@ def test_settings_come_back_as_they_were(tmp_path, plug_in):
     run = begin(tmp_path / "run")
     assert load_run_config(run) == CONFIG
     assert run_id(run) != run_id(begin(tmp_path / "other"))
+    assert is_run_of(run, CONFIG)
+    assert not is_run_of(run, {**CONFIG, "seed": 4})
+    assert not is_run_of(tmp_path, CONFIG)
 
 
 def test_settings_that_were_changed_are_refused(tmp_path, plug_in):
@@ -113,6 +118,6 @@ def test_a_run_that_was_killed_at_once_does_not_stand_in_the_way(tmp_path, plug_
     (run / "config.yaml").unlink()
     (run / ".lock").touch()
     assert create_run_dir(run, name="popl") == run
-    write_run_manifest(run, CONFIG, config_text(OmegaConf.create(CONFIG)))
+    write_run_manifest(run, OmegaConf.create(CONFIG))
     save_config(run, CONFIG)
     assert load_run_config(run) == CONFIG

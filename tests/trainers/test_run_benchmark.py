@@ -198,6 +198,19 @@ def test_a_killed_cell_is_resumed(trainer):
     assert len(times) == 3, "nobody knows how long the first part took"
 
 
+@pytest.mark.parametrize("file", ["cell.json", "results.csv"])
+def test_a_cell_that_was_damaged_is_run_again_and_stops_no_other(trainer, file):
+    before = run(config())
+    damaged = cell_folder("plain/other/seed0") / file
+    damaged.write_text(damaged.read_text()[:-9])
+    with pytest.warns(UserWarning, match="the cell is run again"):
+        after = run(config())
+    assert trainer.resumed == ["out/cells/plain/other/seed0"]
+    assert after.failures == {}
+    one, other = (of.results[of.results.measure != "seconds"] for of in (before, after))
+    assert one.value.tolist() == other.value.tolist()
+
+
 def test_a_killed_cell_that_cannot_be_resumed_is_run_anew(trainer):
     run(config())
     kill("plain/other/seed0")
