@@ -44,11 +44,16 @@ def table_behaviour(probabilities: Tensor, *, first: int = 0) -> Behaviour:
     return act
 
 
-def random_behaviour(action_space: gymnasium.Space[Any]) -> Behaviour:
+def random_behaviour(action_space: gymnasium.Space[Any], *, unbounded: bool = False) -> Behaviour:
     """Uniformly random actions of a ``Discrete`` or bounded ``Box`` space.
 
+    Args:
+        action_space: The space.
+        unbounded: Whether a ``Box`` without bounds will do, of which standard normal actions are
+            drawn.
+
     Raises:
-        TypeError: If the space is neither, or a ``Box`` without bounds.
+        TypeError: If the space is neither, or a ``Box`` without bounds and ``unbounded`` is False.
     """
     if isinstance(action_space, gymnasium.spaces.Discrete):
         first, end = int(action_space.start), int(action_space.start + action_space.n)
@@ -59,5 +64,9 @@ def random_behaviour(action_space: gymnasium.Space[Any]) -> Behaviour:
         low, high = (torch.as_tensor(end).float() for end in (action_space.low, action_space.high))
         return lambda step, generator: (
             low + (high - low) * torch.rand(*step.batch_size, *low.shape, generator=generator)
+        )
+    if isinstance(action_space, gymnasium.spaces.Box) and unbounded:
+        return lambda step, generator: torch.randn(
+            *step.batch_size, *action_space.shape, generator=generator
         )
     raise TypeError(f"action_space must be Discrete or a bounded Box, got {action_space}")

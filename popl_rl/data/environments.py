@@ -18,6 +18,7 @@ import numpy as np
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from popl_rl.data.adapters import adapt_behaviour, adapted, as_gymnasium, native_spaces
 from popl_rl.data.behaviours import (
     Behaviour,
     first_action,
@@ -84,7 +85,8 @@ def make_world(
 ) -> World:
     """Resolve an environment and read off what it offers.
 
-    An environment is any Gymnasium environment. Three methods are used if it, or a wrapper around
+    An environment is any Gymnasium environment, or one of TorchRL's, whose spaces are adapted as
+    ``popl_rl.data.adapters`` says. Three methods are used if it, or a wrapper around
     it, has them:
     ``transition_table()`` (exact regret labels), ``behaviours()`` (what the data shows: by name,
     tables ``[S, A]`` of action probabilities or functions; uniformly random otherwise), and
@@ -121,11 +123,13 @@ def make_world(
             if isinstance(error, KeyboardInterrupt) or not is_foreign(make_env):
                 raise  # ours say in their own words which option is off
             raise failure("env", factory, "making it", error, make_env) from error
+        env = as_gymnasium(env)
         if not isinstance(env, gymnasium.Env):
             raise ValueError(
-                f"env.factory {factory!r} must return a gymnasium.Env, got {type(env)}"
+                f"env.factory {factory!r} must return a gymnasium.Env or a TorchRL EnvBase, got "
+                f"{type(env)}"
             )
-        env = CheckedEnv(env, factory if env_id is None else env_id)
+        env = CheckedEnv(adapted(env), factory if env_id is None else env_id)
         if isinstance(env.action_space, gymnasium.spaces.Box):
             # A Gaussian policy's mean knows no bounds. Gymnasium's own ClipAction would hide the
             # bounds, which random actions need.
@@ -141,12 +145,13 @@ def make_world(
 
     env = make()
     space, first = env.action_space, first_action(env.action_space)
+    native = native_spaces(env)[1]
     table = checked_table(offered(env, "transition_table"), factory)
     given = checked_behaviours(offered(env, "behaviours"), factory)
     behaviours = {
         name: table_behaviour(what, first=first)
         if isinstance(what, Tensor)
-        else checked_behaviour(what, factory, name, space)
+        else adapt_behaviour(checked_behaviour(what, factory, name, native), native)
         for name, what in given.items()
     } or {"random": random_behaviour(space)}
     shares = behaviour_shares(list(behaviours), mixture)

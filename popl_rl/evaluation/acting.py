@@ -97,7 +97,8 @@ class Rolling:
             max_steps=self.max_steps,
             seed=self.seed,
             greedy=self.greedy,
-            random_action=behaviour or random_behaviour(self.world.env.action_space),
+            random_action=behaviour
+            or random_behaviour(self.world.env.action_space, unbounded=True),
         )
 
 

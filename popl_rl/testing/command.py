@@ -4,6 +4,7 @@ import argparse
 import ast
 import logging
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -36,22 +37,33 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = dict(given.arguments)
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # TorchRL sets its own when imported
     try:
-        if given.kind == "env":
-            check_env(given.reference, **arguments)
-        elif given.kind == "rater":
-            check_rater(given.reference, given.env, **arguments)
-        elif given.kind == "selection":
-            check_selection(given.reference, **arguments)
-        elif given.kind == "method":
-            kinds: dict[str, Any] = {"cases": given.cases, "evolve": given.evolve}
-            check_method(given.reference, learns=cast("Any", given.learns), **kinds, **arguments)
-        else:
-            check_reader(given.reference, given.data, given.env, **arguments)
+        with warnings.catch_warnings():
+            warnings.showwarning = cast("Any", _show)
+            _check(given, arguments)
     except (TypeError, ValueError) as error:
         sys.stderr.write(f"{' '.join(str(error).split())}\n")
         return 2
     sys.stdout.write(f"{given.kind} {given.reference}: all checks passed\n")
     return 0
+
+
+def _check(given: argparse.Namespace, arguments: dict[str, Any]) -> None:
+    if given.kind == "env":
+        check_env(given.reference, **arguments)
+    elif given.kind == "rater":
+        check_rater(given.reference, given.env, **arguments)
+    elif given.kind == "selection":
+        check_selection(given.reference, **arguments)
+    elif given.kind == "method":
+        kinds: dict[str, Any] = {"cases": given.cases, "evolve": given.evolve}
+        check_method(given.reference, learns=cast("Any", given.learns), **kinds, **arguments)
+    else:
+        check_reader(given.reference, given.data, given.env, **arguments)
+
+
+def _show(message: Warning | str, *_: Any) -> None:
+    """A warning as a line of its own, without the place in the library that gave it."""
+    sys.stderr.write(f"warning: {' '.join(str(message).split())}\n")
 
 
 def _parser() -> argparse.ArgumentParser:

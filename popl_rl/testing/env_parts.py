@@ -1,8 +1,11 @@
-"""The single checks behind ``popl_rl.testing.check_env``; each raises with a cure.
+"""The single checks behind ``popl_rl.testing.check_env``.
+
+Each raises, with a cure, for what training trips over, and warns of what it does not.
 
 ``name`` is what messages call the environment.
 """
 
+import warnings
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -14,7 +17,8 @@ from torchrl.envs import GymWrapper
 from torchrl.envs.utils import check_env_specs
 
 from popl_rl.data.behaviours import first_action
-from popl_rl.data.environments import counting_from_zero
+from popl_rl.data.environments import counting_from_zero, offered
+from popl_rl.data.rollouts import numeric_info
 from popl_rl.data.tables import Table
 from popl_rl.keys import ACTION, INFO, OBSERVATION, REWARD
 from popl_rl.plug_ins import call
@@ -41,28 +45,13 @@ class Step(NamedTuple):
 
 
 def check_spaces(name: str, env: Env) -> None:
-    """Check that spaces are of the kinds that policies are built for."""
-    seen, acts = env.observation_space, env.action_space
-    if not isinstance(seen, gymnasium.spaces.Box) or len(seen.shape) != 1:
-        raise TypeError(
-            f"env {name!r}: observation_space must be a Box with one dimension, got {seen}; wrap "
-            "it in gymnasium.wrappers.FlattenObservation."
-        )
-    if seen.dtype != np.float32:
-        raise TypeError(
-            f"env {name!r}: observation_space must be float32, got {seen.dtype}; wrap it in "
-            "gymnasium.wrappers.DtypeObservation(env, np.float32)."
-        )
-    if isinstance(acts, gymnasium.spaces.Discrete):
-        return
-    if not isinstance(acts, gymnasium.spaces.Box) or len(acts.shape) != 1:
-        raise TypeError(
-            f"env {name!r}: action_space must be Discrete or a Box with one dimension, got {acts}; "
-            "wrap it in gymnasium.wrappers.TransformAction."
-        )
-    if not acts.is_bounded():
+    """Check that there is something to act with: random actions, or behaviours."""
+    acts = env.action_space
+    bounded = not isinstance(acts, gymnasium.spaces.Box) or acts.is_bounded()
+    if not bounded and offered(env, "behaviours") is None:
         raise ValueError(
-            f"env {name!r}: a Box of actions must be bounded, got {acts}; give it low and high."
+            f"env {name!r}: a Box of actions must be bounded where there are no behaviours(), got "
+            f"{acts}; give it low and high, or behaviours that show what to do."
         )
 
 
@@ -72,7 +61,7 @@ def random_steps(name: str, env: Env, num_steps: int, seed: int) -> list[Step]:
     steps: list[Step] = []
     over = True
     first_reset = True
-    held: tuple[NDArray[Any], NDArray[Any]] | None = None
+    outside = ""
     for _ in range(num_steps):
         if over:
             # Later episodes go on from the first seed, which a careless reset would also get wrong.
@@ -95,16 +84,17 @@ def random_steps(name: str, env: Env, num_steps: int, seed: int) -> list[Step]:
             observation, reward, terminated, truncated, info = answer
             _check_outcome(name, reward, terminated, truncated)
             over = bool(terminated or truncated)
-        _check_observation(name, env, observation)
-        _check_info(name, info, steps[0].info if steps else None)
-        if held is not None and not np.array_equal(held[0], held[1]):
-            raise ValueError(
-                f"env {name!r}: an observation changed after it was returned; return a copy, as in "
-                "observation.copy()."
-            )
-        held = observation, observation.copy()
-        # After the copy, since an environment may also hand out one info again and again.
-        steps.append(Step(action, held[1], float(reward), bool(terminated), dict(info)))
+        seen = _checked_observation(name, env, observation)
+        if not outside and not env.observation_space.contains(seen):
+            outside = f"values from {seen.min():g} to {seen.max():g}"
+        numbers = _checked_info(name, info)
+        steps.append(Step(action, seen, float(reward), bool(terminated), numbers))
+    if outside:
+        warnings.warn(
+            f"env {name!r}: observations should lie in {env.observation_space}, got {outside}; "
+            "training does not mind, others may: correct the space.",
+            stacklevel=3,
+        )
     return steps
 
 
@@ -112,21 +102,23 @@ def _described(answer: Any) -> str:
     return f"{len(answer)} values" if isinstance(answer, tuple) else f"a {type(answer).__name__}"
 
 
-def _check_observation(name: str, env: Env, observation: Any) -> None:
-    space = env.observation_space
-    if not isinstance(observation, np.ndarray) or observation.dtype != np.float32:
-        kind = getattr(observation, "dtype", type(observation).__name__)
+def _checked_observation(name: str, env: Env, observation: Any) -> NDArray[np.float32]:
+    """A copy, since an environment may give the same array again and again."""
+    try:
+        seen = np.array(observation, np.float32)
+    except (TypeError, ValueError):
         raise TypeError(
-            f"env {name!r}: observations must be float32 arrays, got {kind}; use "
-            "observation.astype(np.float32)."
-        )
-    if not np.isfinite(observation).all():
-        raise ValueError(f"env {name!r}: observations must be finite, got {observation}.")
-    if not space.contains(observation):
+            f"env {name!r}: observations must be arrays of numbers, got a "
+            f"{type(observation).__name__}."
+        ) from None
+    if seen.shape != env.observation_space.shape:
         raise ValueError(
-            f"env {name!r}: observations must lie in {space}, got shape {observation.shape} with "
-            f"values from {observation.min():g} to {observation.max():g}; correct the space."
+            f"env {name!r}: observations must have the shape {env.observation_space.shape} of the "
+            f"space, got {seen.shape}; correct the space."
         )
+    if not np.isfinite(seen).all():
+        raise ValueError(f"env {name!r}: observations must be finite, got {observation}.")
+    return seen
 
 
 def _check_outcome(name: str, reward: Any, terminated: Any, truncated: Any) -> None:
@@ -138,42 +130,38 @@ def _check_outcome(name: str, reward: Any, terminated: Any, truncated: Any) -> N
     if not np.isfinite(reward):
         raise ValueError(f"env {name!r}: the reward must be finite, got {reward}.")
     for label, value in (("terminated", terminated), ("truncated", truncated)):
-        if not isinstance(value, (bool, np.bool_)):
+        if not isinstance(value, (bool, int, np.bool_)):
             raise TypeError(
                 f"env {name!r}: {label} must be a bool, got a {type(value).__name__}; use bool()."
             )
 
 
-def _check_info(name: str, info: Any, first: dict[str, float] | None) -> None:
+def _checked_info(name: str, info: Any) -> dict[str, float]:
+    """The numbers in an info; what else is in it does not matter."""
     if not isinstance(info, dict):
         raise TypeError(f"env {name!r}: info must be a dict, got a {type(info).__name__}.")
-    if first is not None and info.keys() != first.keys():
-        raise ValueError(
-            f"env {name!r}: info must have the same keys at every reset and step, got "
-            f"{sorted(first)} and then {sorted(info)}; fill what is missing with a neutral number."
-        )
-    for key, value in info.items():
-        if not isinstance(value, (bool, int, float, np.number, np.bool_)):
-            raise TypeError(
-                f"env {name!r}: info[{key!r}] must be a number, got a {type(value).__name__}; use "
-                "float() or int(), or leave it out."
-            )
+    numbers = numeric_info(info)
+    for key, value in numbers.items():
         if not np.isfinite(value):
             raise ValueError(f"env {name!r}: info[{key!r}] must be finite, got {value}.")
+    return numbers
 
 
 def check_repeats(name: str, first: list[Step], second: list[Step]) -> None:
-    """Check that two runs from one seed are equal."""
+    """Warn unless two runs from one seed are equal."""
     for one, other in zip(first, second, strict=True):
         if not (
             np.array_equal(one.observation, other.observation)
             and (one.reward, one.terminated, one.info)
             == (other.reward, other.terminated, other.info)
         ):
-            raise ValueError(
-                f"env {name!r}: the same seed and actions must give the same episodes, but they "
-                "differ; call super().reset(seed=seed) and draw from self.np_random only."
+            warnings.warn(
+                f"env {name!r}: the same seed and actions should give the same episodes, but they "
+                "differ, so that no run can be repeated; call super().reset(seed=seed) and draw "
+                "from self.np_random only.",
+                stacklevel=3,
             )
+            return
 
 
 def check_table(name: str, table: Any, env: Env, steps: list[Step]) -> None:
@@ -241,7 +229,7 @@ def _disagree(name: str, what: str) -> None:
 
 
 def check_torchrl(name: str, env: Env) -> None:
-    """Check that TorchRL can wrap the environment."""
+    """Warn unless TorchRL can wrap the environment, which fine-tuning with its losses needs."""
     # TorchRL counts discrete actions from 0 whatever the space says.
     counted = counting_from_zero(env)
     level = logger.level
@@ -251,9 +239,11 @@ def check_torchrl(name: str, env: Env) -> None:
         with torch.random.fork_rng(devices=[]):
             check_env_specs(GymWrapper(counted, categorical_action_encoding=True))
     except Exception as error:
-        raise ValueError(
+        warnings.warn(
             f"env {name!r}: TorchRL's check_env_specs failed with {type(error).__name__}: "
-            f"{error} Make the spaces describe what reset and step return."
-        ) from error
+            f"{error} Training does not need it; to use TorchRL's losses, make the spaces describe "
+            "what reset and step return.",
+            stacklevel=3,
+        )
     finally:
         logger.setLevel(level)

@@ -27,10 +27,15 @@ def check_env(env: EnvReference, *, num_steps: int = 200, seed: int = 0, **argum
         **arguments: Keyword arguments for the factory.
 
     Raises:
-        TypeError: If spaces, observations, rewards or infos are of another kind than expected.
-        ValueError: If the environment fails, is not reproducible, gives numbers out of its space or
-            not finite, changes its info keys, fails TorchRL's check, or has a transition table or
+        TypeError: If spaces, observations, rewards or infos are of another kind than training can
+            take; ``popl_rl.data.adapters`` says which.
+        ValueError: If the environment fails, gives numbers that are not finite or observations of
+            another shape than its space's, has nothing to act with, or has a transition table or
             behaviours that do not describe it.
+
+    Warns:
+        UserWarning: Of what training does not mind: episodes that a seed does not repeat,
+            observations out of their space, and what TorchRL's own check finds.
 
     Example:
         >>> from popl_rl.testing import check_env, tiny_env

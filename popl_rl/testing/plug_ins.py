@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 
 from popl_rl import registry
+from popl_rl.data.adapters import adapted, as_gymnasium
 from popl_rl.data.behaviours import random_behaviour
 from popl_rl.data.rollouts import MASK, lockstep
 from popl_rl.data.segments import cut_segments
@@ -42,7 +43,7 @@ def made_env(name: str, env: EnvReference, arguments: dict[str, Any]) -> Iterato
             raise TypeError(
                 f"env {name!r} is made already and takes no arguments, got {arguments}."
             )
-        yield env
+        yield _flat(name, env)
         return
     factory = registry.resolve("env", env) if isinstance(env, str) else env
     if not callable(factory):
@@ -50,22 +51,30 @@ def made_env(name: str, env: EnvReference, arguments: dict[str, Any]) -> Iterato
             f"env must be a gymnasium.Env, a function that makes one, or a reference to it, got a "
             f"{type(env).__name__}."
         )
-    made = call("env", name, "making it", factory, **arguments)
+    made = as_gymnasium(call("env", name, "making it", factory, **arguments))
     if not isinstance(made, gymnasium.Env):
         raise TypeError(
             f"env {name!r} must return a gymnasium.Env, got a {type(made).__name__}; subclass "
             "gymnasium.Env, or wrap what you have."
         )
     try:
-        yield made
+        yield _flat(name, made)
     finally:
         made.close()
+
+
+def _flat(name: str, env: Env) -> Env:
+    """The environment as training sees it."""
+    try:
+        return adapted(env)
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"env {name!r}: {error}.") from error
 
 
 def random_segments(env: Env, seed: int) -> TensorDictBase:
     """Return segments of random actions, of 5 steps unless episodes are shorter."""
     generator = torch.Generator().manual_seed(seed)
-    acts = random_behaviour(env.action_space)
+    acts = random_behaviour(env.action_space, unbounded=True)
     episodes = [
         lockstep([env], lambda step: acts(step, generator), seeds=[seed + index], max_steps=50)
         for index in range(8)
