@@ -115,7 +115,10 @@ def test_continuous_actions_are_clipped():
             {"factory": "gymnasium:make", "id": "NoSuchWorld-v0"},
             "env.factory 'gymnasium:make' cannot be built with id 'NoSuchWorld-v0'",
         ),
-        ({"factory": "builtins:dict"}, r"must return a gymnasium.Env or a TorchRL EnvBase, got <class 'dict'>"),
+        (
+            {"factory": "builtins:dict"},
+            r"must return a gymnasium.Env or a TorchRL EnvBase, got <class",
+        ),
         (
             {"factory": "popl_rl.testing:tiny_env", "mixture": {"planner/*": 1.0}},
             r"env.mixture 'planner/\*' matches no behaviour; there are random",
