@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from popl_rl.data.comparisons import Comparisons
-from popl_rl.models.preference_likelihood import per_case
+from popl_rl.models.preference_likelihood import leave_one_out, per_case
 
-__all__ = ["Nested", "nested_subsets", "sufficient_size"]
+__all__ = ["Nested", "nested_subsets", "predicted", "sufficient"]
 
 
 class Nested(NamedTuple):
@@ -21,13 +21,6 @@ class Nested(NamedTuple):
 
     order: list[int]
     value: Tensor
-
-    def gains(self) -> list[tuple[float, float]]:
-        """What each member after the first adds: mean and standard error, paired over raters."""
-        gain = self.value.diff(dim=0)
-        # A single rater has no spread to judge by.
-        error = gain.std(1, correction=0) / gain.shape[1] ** 0.5 if len(gain) else gain.mean(1)
-        return list(zip(gain.mean(1).tolist(), error.tolist(), strict=True))
 
 
 def nested_subsets(
@@ -66,17 +59,29 @@ def nested_subsets(
     return Nested(order, torch.stack(values))
 
 
-def sufficient_size(nested: Nested, *, evidence: float) -> int:
-    """How many members of nested subsets earn their place.
-
-    The largest subset of which every member has improved the prediction by more than ``evidence``
-    standard errors, paired over raters.
+def predicted(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
+    """How well a set predicts each rater, every answer by the member that the others speak for.
 
     Args:
-        nested: The subsets.
-        evidence: Standard errors; with 0 any improvement counts, with more there are fewer members.
+        likelihood: Log-likelihood of every comparison under every member, ``[K, M]``.
+        comparisons: The M comparisons and the case of each.
+
+    Returns:
+        Mean log-likelihood of each rater's answers, ``[C]``; 0 for a rater without answers.
     """
-    for size, (gain, error) in enumerate(nested.gains(), start=1):
-        if gain <= evidence * error:
-            return size
-    return len(nested.order)
+    count = comparisons.sizes().clamp(min=1e-6)
+    return per_case(leave_one_out(likelihood, comparisons), comparisons) / count
+
+
+def sufficient(behind: Tensor, *, evidence: float) -> int:
+    """The smallest of several sets that is hardly behind the best.
+
+    Args:
+        behind: How far each set is behind the best in the prediction of each rater, ``[S, C]``, the
+            sets by their sizes.
+        evidence: Standard errors, paired over raters, by which a set may be behind; with 0 the best
+            is taken, with 1 the rule is the one of Breiman et al. (1984).
+    """
+    error = behind.std(1, correction=0) / behind.shape[1] ** 0.5
+    good = behind.mean(1) <= evidence * error
+    return int(good.float().argmax())

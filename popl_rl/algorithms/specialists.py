@@ -13,7 +13,7 @@ from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.population import Population
 from popl_rl.models.scoring import case_values
 
-__all__ = ["Specialists", "specialists", "train_specialists"]
+__all__ = ["Specialists", "personalise", "specialists", "train_specialists"]
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,43 @@ def specialists(
         generator=generator,
     )
     return copies
+
+
+def personalise(
+    problem: Problem,
+    population: Population,
+    raters: Tensor,
+    *,
+    steps: int,
+    learning_rate: float,
+    batch_size: int,
+    generator: torch.Generator,
+) -> Population:
+    """Train each member for a moment on the answers of one rater.
+
+    Args:
+        problem: What is to be learnt.
+        population: S members, changed in place.
+        raters: The rater of each, by their cases, ``[S]``.
+        steps: Gradient steps.
+        learning_rate: Adam's step size.
+        batch_size: Answers per step.
+        generator: Source of the batches.
+
+    Returns:
+        The population.
+    """
+    comparisons = problem.comparisons
+    descend(
+        problem.loss(population),
+        torch.optim.Adam(population.members.parameters(), lr=learning_rate),
+        comparisons,
+        steps=steps,
+        batch_size=batch_size,
+        weight=(comparisons.case == raters.unsqueeze(1)).float(),
+        generator=generator,
+    )
+    return population
 
 
 def train_specialists(

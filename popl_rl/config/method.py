@@ -90,16 +90,18 @@ class RefinementSettings:
 
 @dataclass
 class NicheSettings:
-    """POPL for many groups: when members come and go."""
+    """POPL for any number of groups: searches for niches, and how many of these there are."""
 
-    specialists: int = 256  # raters, at most, for each of whom a specialist may be selected
-    selections: int = 1  # times that unneeded members make room for selected specialists
-    settled: float = 0.45  # share of the generations after which only needed members are left
-    evidence: float = 0.5  # standard errors by which a member has to improve the prediction
+    searches: int = 3  # searches side by side; each rater is held out of one of them
+    specialists: int = 256  # raters, at most, for each of whom a specialist may be a founder
+    selections: int = 6  # times in a search that unneeded members make room for children
+    settled: float = 0.55  # share of the generations after which the size is chosen
+    evidence: float = 0.5  # standard errors by which a smaller set may predict raters worse
 
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
         at.at_least_one(self, "specialists", "selections")
+        at.expect(self.searches >= 2, "searches", "at least 2", self.searches)
         at.expect(0 < self.settled < 1, "settled", "in (0, 1)", self.settled)
         at.not_negative(self, "evidence")
 

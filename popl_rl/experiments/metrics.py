@@ -101,4 +101,4 @@ def write_sizes(method: Any, path: Path) -> None:
     sizes = getattr(method, "sizes", None)
     if sizes:
         rows = [f"{size},{mean:.6f},{error:.6f}\n" for size, mean, error in sizes]
-        write_atomic(path, "".join(["members,log_likelihood,error_of_gain\n", *rows]))
+        write_atomic(path, "".join(["members,log_likelihood,error\n", *rows]))
