@@ -7,8 +7,9 @@ Nothing here imports raters: a learner cannot see who voted.
 ``variation``: how children differ from their parents; ``rater_similarity``: who wants alike.
 ``popl``: POPL; ``assembly``: POPL from its settings; ``refinement``: its last training;
 ``mixture_population``: POPL without rater ids.
-``niches``: POPL for many groups; ``specialists``: a member for a rater; ``needed``: which members
-held-out raters need; ``stacked_adam``: an optimiser for a population that grows and shrinks.
+``niches``: POPL for any number of groups; ``niche_search``: one of its searches;
+``specialists``: a member for a rater; ``needed``: which members, and how many, raters need;
+``stacked_adam``: an optimiser for a population that grows and shrinks.
 ``multi_cpl``: CPL ensembles; ``cpl``: pooled CPL and the oracle; ``em``: EM mixtures; ``vpl``: a
 latent variable; ``brex``, ``dpl``, ``reward_baselines``: reward learners that know no groups.
 ``trainer``: any method as a TorchRL Trainer with checkpoints; ``plugged``: methods and selection

@@ -10,6 +10,8 @@ from popl_rl.models.preference_likelihood import leave_one_out, per_case
 
 __all__ = ["Nested", "nested_subsets", "predicted", "sufficient"]
 
+_NEGLIGIBLE = 0.002  # nats of an answer that are not worth a member
+
 
 class Nested(NamedTuple):
     """Nested subsets of a population, each with one member more than the one before.
@@ -76,6 +78,9 @@ def predicted(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
 def sufficient(behind: Tensor, *, evidence: float) -> int:
     """The smallest of several sets that is hardly behind the best.
 
+    Besides, a set may be behind by 0.2 % in the chance of an answer, however sure that is: where
+    raters of one group never err, each further member helps a little.
+
     Args:
         behind: How far each set is behind the best in the prediction of each rater, ``[S, C]``, the
             sets by their sizes.
@@ -83,5 +88,5 @@ def sufficient(behind: Tensor, *, evidence: float) -> int:
             is taken, with 1 the rule is the one of Breiman et al. (1984).
     """
     error = behind.std(1, correction=0) / behind.shape[1] ** 0.5
-    good = behind.mean(1) <= evidence * error
+    good = behind.mean(1) <= (evidence * error).clamp(min=_NEGLIGIBLE)
     return int(good.float().argmax())

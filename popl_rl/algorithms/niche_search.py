@@ -4,9 +4,9 @@ A search never learns of some raters, who judge how many members there should be
 are divided among the members by degrees: a member serves a rater with the probability that the
 rater's answers are its own, ``share_k prod p(answer)``, normalised over the members (the E-step of
 Dempster, Laird and Rubin, 1977), and descends CPL on those whom it serves. Left alone, members
-settle where they began, and a group that nobody began with is lost. So, now and then, members that nobody needs
-make room for children: copies of parents that lexicase selects for one rater, which learn for a
-moment what that rater said (gradient lexicase, Ding and Spector, ICLR 2022).
+settle where they began, and a group that nobody began with is lost. So, now and then, members that
+nobody needs make room for children: copies of parents that lexicase selects for one rater, which
+learn for a moment what that rater said (gradient lexicase, Ding and Spector, ICLR 2022).
 """
 
 from collections.abc import Sequence

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from popl_rl.algorithms.needed import Nested, nested_subsets, sufficient_size
+from popl_rl.algorithms.needed import nested_subsets, predicted, sufficient
 from popl_rl.data.comparisons import Comparisons
 
 
@@ -37,16 +37,18 @@ def test_an_answer_does_not_choose_the_member_that_predicts_it():
     torch.testing.assert_close(nested.value, torch.tensor([[-2.55], [-5.0]]))
 
 
-def test_a_member_has_to_gain_more_than_its_error():
-    """Gains of 1 and 3 have mean 2, deviation 1 and error 1 / sqrt(2)."""
-    nested = Nested([0, 1], torch.tensor([[0.0, 0.0], [1.0, 3.0]]))
-    assert sufficient_size(nested, evidence=2.8) == 2
-    assert sufficient_size(nested, evidence=2.9) == 1
+def test_a_set_is_judged_by_answers_that_did_not_choose():
+    """Rater 0's answers choose members 0 and 1 for each other; rater 2 has none."""
+    likelihood = torch.tensor([[-0.1, -5.0, -0.2], [-5.0, -0.3, -0.1]])
+    value = predicted(likelihood, of_raters([0, 0, 1]))
+    assert value.tolist() == pytest.approx([-5.0, -0.2])
 
 
-def test_what_comes_after_a_useless_member_is_left_out():
-    nested = Nested([0, 1, 2], torch.tensor([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0]]))
-    assert sufficient_size(nested, evidence=0.0) == 1
+def test_the_smallest_that_is_hardly_behind():
+    """One set is behind by 1 and 3: mean 2, deviation 1, error 1 / sqrt(2), so 2.83 errors."""
+    behind = torch.tensor([[1.0, 3.0], [0.0, 0.0], [0.0, 0.0]])
+    assert sufficient(behind, evidence=2.8) == 1
+    assert sufficient(behind, evidence=2.9) == 0
 
 
 @given(st.integers(1, 6), st.integers(1, 5), st.integers(1, 4), st.integers(0, 99))
@@ -56,7 +58,9 @@ def test_every_member_enters_once_and_order_does_not_matter(members, raters, ans
     likelihood = -torch.rand(members, len(case), generator=generator, dtype=torch.float64)
     nested = nested_subsets(likelihood, of_raters(case))
     assert sorted(nested.order) == list(range(members))
-    assert 1 <= sufficient_size(nested, evidence=1.0) <= members
+    # A set of all members in any order predicts alike.
+    whole = predicted(likelihood, of_raters(case))
+    torch.testing.assert_close(nested.value[-1], whole)
     turned = nested_subsets(likelihood.flip(0), of_raters(case))
     torch.testing.assert_close(turned.value[0].mean(), nested.value[0].mean())
 

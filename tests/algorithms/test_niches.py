@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from popl_rl.algorithms.niche_search import NicheSearch, sizes_up_to
 from popl_rl.algorithms.niches import NichePOPL
 from popl_rl.algorithms.problem import Problem
 from popl_rl.config import NicheSettings, POPLSettings, Training
@@ -51,27 +52,80 @@ def served(found, bank, comparisons, group):
     return [float(values[:, group == one].mean(1).max()) for one in group.unique()]
 
 
-@pytest.mark.parametrize("groups", [1, 2])
+@pytest.mark.parametrize("groups", [1, 2, 3])
 def test_it_finds_as_many_as_there_are(groups):
-    bank, comparisons, group = ring(groups)
+    bank, comparisons, group = ring(groups, raters=30)
     method = build(bank, comparisons)
     found, metrics = run(method)
-    assert len(found) == groups
-    assert min(served(found, bank, comparisons, group)) > 0.9
-    assert metrics[-1]["members"] == groups
-    assert [size for size, _, _ in method.sizes] == list(range(1, len(method.sizes) + 1))
+    # Three overlap on the ring; of one and two it must not miss the number.
+    assert len(found) in ((groups,) if groups < 3 else (3, 4))
+    assert min(served(found, bank, comparisons, group)) > 0.8
+    assert metrics[-1]["members"] >= len(found)
+    assert [size for size, _, _ in method.sizes] == [1, 2, 3, 5, 8]
 
 
-def test_half_of_the_raters_say_nothing_to_a_copy():
-    """Labels of one half turned round: the copy that never learns of it stays the same."""
+def test_each_rater_is_held_out_of_one_search():
+    """Answers of the held out turned round: the search never learns of them and stays the same."""
+    bank, comparisons, _ = ring(2, raters=6)
+    out = torch.arange(comparisons.num_cases) % 3 == 0
+    aside = out[comparisons.case]
+    turned = replace(
+        comparisons,
+        preferred=torch.where(aside, comparisons.other, comparisons.preferred),
+        other=torch.where(aside, comparisons.preferred, comparisons.other),
+    )
+    stacks = []
+    for answers in (comparisons, turned):
+        problem = build(bank, answers).problem
+        search = NicheSearch(
+            problem,
+            held_out=out,
+            popl=POPL,
+            niches=NicheSettings(),
+            generator=torch.Generator().manual_seed(0),
+        )
+        search.step()
+        stacks.append(
+            torch.cat([value.flatten() for value in search.stack.members.data.values(True, True)])
+        )
+    assert torch.equal(*stacks)
+    method = build(bank, comparisons)
+    times = sum((~torch.isin(torch.arange(12), search.raters)).int() for search in method.searches)
+    assert times.tolist() == [1] * 12
+
+
+def test_children_take_the_places_of_members_that_nobody_needs():
     bank, comparisons, _ = ring(2)
-    one = build(bank, comparisons)
-    weight = one._trained_on()
-    half = one.half[comparisons.case]
-    assert torch.equal(weight.sum(0), torch.ones_like(half))
-    assert torch.equal(weight[0], half)
-    told = one._told(torch.stack([torch.zeros(len(half)), torch.ones(len(half))]))
-    assert torch.equal(told.squeeze(0), half.float())
+    search = build(bank, comparisons, members=12).searches[0]
+    before = search.stack.members.data.clone()
+    search.replace_unneeded()
+    assert len(search.stack) == 12
+    assert float(search.share.sum()) == pytest.approx(1)
+    same = [
+        any(bool((one == other).all()) for other in before["0", "weight"])
+        for one in search.stack.members.data["0", "weight"]
+    ]
+    assert 1 <= sum(same) <= 9  # three quarters stay at most, children have learnt
+
+
+def test_sizes_grow_by_half():
+    assert sizes_up_to(30) == [1, 2, 3, 5, 8, 12, 18, 27]
+    assert sizes_up_to(1) == [1]
+
+
+def test_populations_of_several_sizes_train_side_by_side():
+    bank, comparisons, _ = ring(2)
+    search = build(bank, comparisons, members=8).searches[0]
+    search.divide()
+    assert search.sizes == sizes_up_to(search.sizes[-1])
+    assert len(search.stack) == sum(search.sizes)
+    search.step()
+    ends = torch.tensor(search.sizes).cumsum(0).tolist()
+    for begin, end in zip([0, *ends], ends, strict=False):
+        assert float(search.share[begin:end].sum()) == pytest.approx(1, abs=1e-5)
+    values = search.values()
+    assert values.shape == (len(search.sizes), comparisons.num_cases)
+    assert (values[:, search.raters] == 0).all()
 
 
 def test_too_few_members_are_said():
@@ -105,7 +159,7 @@ def test_it_goes_on_to_the_bit(at):
         after.step()
     for _ in range(through.generations):
         through.step()
-    assert torch.equal(through.share, after.share)
+    assert torch.equal(through.found.share, after.found.share)
     assert through.sizes == after.sizes
     for one, other in zip(
         through.population.members.data.values(True, True),
