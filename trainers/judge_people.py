@@ -43,13 +43,15 @@ class Result:
 def run(config: Config) -> Result:
     """Compare methods on all folds, or go on where a killed comparison was stopped."""
     config = prepare(config)
+    is_new = config.resume is None
     # Imported late, so that a wrong setting is told at once.
     with importing():
         from popl_rl.experiments import people_steps, steps
 
     opened = steps.open_run(config, command=sys.argv, given=given_overrides())
     with opened as (config, run_dir, _):
-        people = people_steps.read_people(config, run_dir)
+        with steps.kept_unless_refused(run_dir, is_new=is_new):
+            people = people_steps.read_people(config, run_dir)
         told = ["oracle"] if any(people.groups) and config.method.ties == "drop" else []
         methods = [*people_steps.REFERENCES, *told, *config.people.methods]
         table = people_steps.compare_methods(

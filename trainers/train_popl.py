@@ -57,7 +57,7 @@ def run(config: Config) -> Result:
     opened = steps.open_run(config, command=sys.argv, given=given_overrides())
     with opened as (config, run_dir, place):
         if place is None:
-            return _run_people(config, run_dir)
+            return _run_people(config, run_dir, is_new=is_new)
         return _run_groups(config, run_dir, place, is_new=is_new)
 
 
@@ -87,7 +87,7 @@ def _run_groups(config: Config, run_dir: Path, place: "Place", *, is_new: bool) 
     return Result(run_dir, found, board)
 
 
-def _run_people(config: Config, run_dir: Path) -> Result:
+def _run_people(config: Config, run_dir: Path, *, is_new: bool) -> Result:
     """Learn from real people's answers, and judge by people who were held out."""
     from popl_rl.evaluation.results import Scoreboard
     from popl_rl.experiments import people_steps, steps
@@ -95,8 +95,9 @@ def _run_people(config: Config, run_dir: Path) -> Result:
     from popl_rl.experiments.run_sets import save_anew
 
     # 1. What people said, and who of them is held out.
-    people = people_steps.read_people(config, run_dir)
-    fold = split(people, config.people, 0, ties=config.method.ties, seed=config.seed)
+    with steps.kept_unless_refused(run_dir, is_new=is_new):
+        people = people_steps.read_people(config, run_dir)
+        fold = split(people, config.people, 0, ties=config.method.ties, seed=config.seed)
 
     # 2. The population, evolved.
     with steps.open_logger(config, run_dir) as logger:

@@ -26,7 +26,8 @@ class PeopleConfig:
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
         at.at_least_one(self, "repeats", "individual_steps", "most_groups")
-        at.expect(2 <= self.folds <= 1000, "folds", "in 2..1000", self.folds)
+        at.expect(self.folds >= 2, "folds", "at least 2", self.folds)
+        at.not_negative(self, "folds", most=1000)
         at.expect(self.least >= 2, "least", "at least 2: one to tell, one to judge", self.least)
         at.not_negative(self, "least", most=10**6)
         at.expect(bool(self.curve), "curve", "numbers of at least 0", list(self.curve))
