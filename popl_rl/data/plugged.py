@@ -100,10 +100,10 @@ class CheckedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _check_observation(self, observation: Any, doing: str) -> None:
         is_usual = type(observation) is np.ndarray and observation.shape == self._shape
-        # A finite sum of squares is cheap, and says that each of them is finite.
-        if is_usual and observation.ndim == 1 and math.isfinite(observation @ observation):
-            return
         try:
+            # A finite sum of squares is cheap, and says that each of them is finite.
+            if is_usual and observation.ndim == 1 and math.isfinite(observation @ observation):
+                return
             seen = np.asarray(observation)
             finite = bool(np.isfinite(seen).all())
         except (TypeError, ValueError):
