@@ -46,7 +46,9 @@ def block_with(page, what):
 LINES = [
     line.strip() for page in PAGES for block in blocks(page, "bash") for line in block.split("\n")
 ]
-COMMANDS = sorted({line for line in LINES if line.startswith(tuple(CONFIGS))})
+#: With files of one's own beside them, which are tried in tests/trainers/test_new_env.py.
+OWN = "--config-dir"
+COMMANDS = sorted({line for line in LINES if line.startswith(tuple(CONFIGS)) and OWN not in line})
 LAUNCHED = sorted({line for line in LINES if line.startswith(("python -m", "python tests"))})
 
 
@@ -168,11 +170,11 @@ def test_every_setting_is_documented_and_exists(schema, section):
 
 def test_the_environment_and_the_raters_shown_can_be_used(config_of, tiny, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path("my_env.py").write_text(block_with("envs/README.md", "class Line"))
+    Path("line.py").write_text(block_with("envs/README.md", "class Line"))
     Path("my_raters.py").write_text(block_with("envs/README.md", "def left"))
-    check_env("my_env.py:Line")
-    check_rater("my_raters.py:left", "my_env.py:Line")
-    own = ["env=custom", "env.factory=my_env.py:Line", "raters.label=return"]
+    check_env("line.py:Line")
+    check_rater("my_raters.py:left", "line.py:Line")
+    own = ["env=custom", "env.factory=line.py:Line", "raters.label=return"]
     groups = "raters.groups=[my_raters.py:left, my_raters.py:right]"
     result = train_popl.run(config_of(*own, groups, *tiny[1:], "env.success=right", "run_dir=run"))
     assert set(result.board.results.group) >= {"left", "right"}
