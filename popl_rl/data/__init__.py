@@ -1,7 +1,8 @@
 """Behaviour to be compared: environments, episodes, segments, and the comparisons of segments.
 
 * ``environments``: environments built from settings; ``tables``: their transitions, solved exactly;
-  ``plugged``: environments of other people and what they offer, checked wherever they are called.
+  ``adapters``: environments of any spaces as learners take them; ``plugged``: environments of other
+  people and what they offer, checked wherever they are called.
 * ``behaviours``: who acts while data are collected; ``rollouts``: whole episodes in lockstep.
 * ``segments``: episodes cut into segments; ``store``: segments that several runs share;
   ``saved``: segments and preferences in a folder, checked whenever they are read.

@@ -86,8 +86,7 @@ def make_world(
     """Resolve an environment and read off what it offers.
 
     An environment is any Gymnasium environment, or one of TorchRL's, whose spaces are adapted as
-    ``popl_rl.data.adapters`` says. Three methods are used if it, or a wrapper around
-    it, has them:
+    ``popl_rl.data.adapters`` says. Three methods are used if it, or a wrapper around it, has them:
     ``transition_table()`` (exact regret labels), ``behaviours()`` (what the data shows: by name,
     tables ``[S, A]`` of action probabilities or functions; uniformly random otherwise), and
     ``collect_segments(...)`` (see ``Collect``), which collects the data itself.
@@ -123,19 +122,7 @@ def make_world(
             if isinstance(error, KeyboardInterrupt) or not is_foreign(make_env):
                 raise  # ours say in their own words which option is off
             raise failure("env", factory, "making it", error, make_env) from error
-        env = as_gymnasium(env)
-        if not isinstance(env, gymnasium.Env):
-            raise ValueError(
-                f"env.factory {factory!r} must return a gymnasium.Env or a TorchRL EnvBase, got "
-                f"{type(env)}"
-            )
-        env = CheckedEnv(adapted(env), factory if env_id is None else env_id)
-        if isinstance(env.action_space, gymnasium.spaces.Box):
-            # A Gaussian policy's mean knows no bounds. Gymnasium's own ClipAction would hide the
-            # bounds, which random actions need.
-            clip = partial(np.clip, a_min=env.action_space.low, a_max=env.action_space.high)
-            env = gymnasium.wrappers.TransformAction(env, clip, env.action_space)
-        return env
+        return _prepared(env, factory, factory if env_id is None else env_id)
 
     def make() -> gymnasium.Env[Any, Any]:
         return build(dict(options or {}))
@@ -159,6 +146,24 @@ def make_world(
     if offered(env, "collect_segments") is not None:
         collect = checked_collect(offered(make_for_data(), "collect_segments"), factory)
     return World(make, make_for_data, env, behaviours, shares, table, collect)
+
+
+def _prepared(env: Any, factory: str, name: str) -> gymnasium.Env[Any, Any]:
+    """What a factory has returned, checked, adapted, and with actions clipped to their bounds."""
+    try:
+        env = as_gymnasium(env)
+        if not isinstance(env, gymnasium.Env):
+            raise ValueError(f"must return a gymnasium.Env or a TorchRL EnvBase, got {type(env)}")
+        made = CheckedEnv(adapted(env), name)
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"env.factory {factory!r}: {error}") from error
+    space = made.action_space
+    if not isinstance(space, gymnasium.spaces.Box):
+        return made
+    # A Gaussian policy's mean knows no bounds. Gymnasium's own ClipAction would hide the bounds,
+    # which random actions need.
+    clip = partial(np.clip, a_min=space.low, a_max=space.high)
+    return gymnasium.wrappers.TransformAction(made, clip, space)
 
 
 def offered(env: gymnasium.Env[Any, Any], name: str) -> Any:

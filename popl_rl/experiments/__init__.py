@@ -3,7 +3,8 @@
 - From settings: ``builders`` makes what is learnt, ``data`` the segments and preferences
   (``asked`` keeps which groups gave them), ``label_data`` segments for people to compare, and
   ``evaluators`` the evaluator. Settings objects go no further than this package.
-- A run's folder: ``run_folder``, ``metrics``, ``loggers``, and its ``report``; ``run_manifest``,
+- A run's folder: ``run_folder``, ``metrics``, ``loggers``, and its ``report``; ``progress`` and
+  ``foresight`` tell how far it is and how long it will take; ``run_manifest``,
   ``run_sets`` and ``plug_ins`` tell whether what is in it belongs together.
 - A benchmark: ``suites`` reads what is compared, ``cells`` plans it and collects what came out,
   ``jobs`` runs it in processes, ``benchmark_tables`` and ``benchmark_report`` tell the results.

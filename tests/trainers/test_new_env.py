@@ -1,4 +1,4 @@
-"""The world that ``popl-new`` writes is complete: checked, trained in, and changed by its settings."""
+"""The world that ``popl-new`` writes is complete: it passes checks, and one can train in it."""
 
 import sys
 
