@@ -15,8 +15,10 @@ __all__ = ["as_typed", "opened"]
 
 #: Groups of settings that are chosen by a name, each with a choice.
 _GROUPS = {"env": "two_doors", "raters": "two_groups", "method": "popl", "logger": "csv"}
-#: One name, or several for a sweep, quoted or not.
-_CHOICE = re.compile(r"""(['"]?[\w./-]*[A-Za-z][\w./-]*['"]?,?)+|(choice|glob)\(.*\)""")
+#: A name, quoted or not.
+_NAME = re.compile(r"""['"]?[\w./-]*[A-Za-z][\w./-]*['"]?""")
+#: A sweep with a function.
+_SWEEP = re.compile(r"\w+\(.*\)")
 
 
 def opened(overrides: Sequence[str]) -> list[str]:
@@ -56,7 +58,7 @@ def as_typed(arguments: Sequence[str], schema: type) -> list[str]:
     kept = []
     for argument in arguments:
         key, equals, value = argument.partition("=")
-        if key in _GROUPS and equals and not _CHOICE.fullmatch(value):
+        if key in _GROUPS and equals and not _is_choice(value):
             raise ValueError(
                 f"{key} must be a choice by its name, as in {key}={_GROUPS[key]}, got {argument}; "
                 f"settings of it are given one by one, as in {key}.name=value"
@@ -65,6 +67,12 @@ def as_typed(arguments: Sequence[str], schema: type) -> list[str]:
             argument = f"{key}={','.join(_quoted(part, parser) for part in value.split(','))}"
         kept.append(argument)
     return kept
+
+
+def _is_choice(value: str) -> bool:
+    """Whether a value names a choice of a group, or several for a sweep."""
+    named = all(_NAME.fullmatch(part) for part in value.split(","))
+    return named or _SWEEP.fullmatch(value) is not None
 
 
 def _quoted(value: str, parser: OverridesParser) -> str:

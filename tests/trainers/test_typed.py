@@ -102,3 +102,16 @@ def test_a_resumed_run_takes_what_may_change_and_keeps_the_rest(config_of, tiny,
     assert config.seed == 3
     kept = OmegaConf.load(run_dir / "config.yaml")
     assert kept.checkpoint_interval == first.checkpoint_interval
+
+
+@pytest.mark.parametrize("typed", ["env=5", "raters=[1]", "method={name:popl}", "logger=3,4"])
+def test_a_group_of_settings_is_chosen_by_name(typed):
+    with pytest.raises(ValueError, match=rf"{typed[:3]}\w* must be a choice by its name, as in"):
+        as_typed([typed], Config)
+
+
+@pytest.mark.parametrize(
+    "typed", ["env=metaworld/any", "method='popl'", "raters=a,b", "method=glob(popl*)"]
+)
+def test_choices_and_sweeps_of_them_are_names(typed):
+    assert as_typed([typed], Config) == [typed]
