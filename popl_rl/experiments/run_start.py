@@ -21,6 +21,7 @@ from popl_rl.experiments.run_folder import (
 )
 from popl_rl.experiments.run_manifest import load_run_config, write_run_manifest
 from popl_rl.interruption import Terminated
+from popl_rl.memory import keep_freed_memory
 
 __all__ = ["kept_unless_refused", "open_run"]
 
@@ -96,6 +97,7 @@ def _prepared(config: Config) -> Place | None:
     """Where the run takes place, after this process was told how it is to compute."""
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # TorchRL sets its own when imported
     torch.set_num_threads(config.threads)
+    keep_freed_memory()
     return survey(config)
 
 
