@@ -1,7 +1,7 @@
 """How well each group is served, in a word that follows from intervals."""
 
 from dataclasses import dataclass
-from math import hypot, nan
+from math import hypot, isnan, nan
 
 import pandas as pd
 
@@ -63,6 +63,8 @@ class Verdict:
     reason: str = ""
 
     def __str__(self) -> str:
+        if isnan(self.share):
+            return f"{self.group}: {self.word} ({self.best} has {self.reason})"
         ends = f"[{self.low:z.2f}, {self.high:z.2f}]"
         text = f"{self.group}: {self.word} ({self.share:z.2f} {ends} of {self.best}"
         return f"{text}; {self.reason})" if self.reason else f"{text})"

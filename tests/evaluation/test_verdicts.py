@@ -54,6 +54,7 @@ def test_a_word_for_each_group(word, best, returns):
     assert verdict.word == word, str(verdict)
     assert verdict.best.startswith(best)
     assert str(verdict).startswith(f"fast: {word} (")
+    assert "nan" not in str(verdict)
 
 
 def test_intervals_are_those_of_the_share():
