@@ -14,6 +14,7 @@ from popl_rl.evaluation.method_names import METHODS, sort_key
 __all__ = [
     "HEADLINES",
     "RESULT_COLUMNS",
+    "differs_from_zero",
     "entries",
     "headline_measure",
     "interval",
@@ -119,6 +120,26 @@ def interval(
         return float(numbers.mean()), float("nan")
     error = numbers.std(ddof=1) / np.sqrt(len(numbers))
     return float(numbers.mean()), float(stats.t.ppf(0.975, len(numbers) - 1) * error)
+
+
+def differs_from_zero(samples: Sequence[Sequence[float]], *, level: float = 0.05) -> list[bool]:
+    """Which means differ from 0, judged together: t-tests with the step-down of Holm (1979).
+
+    Args:
+        samples: Values of each; fewer than two tell nothing, and are not counted.
+        level: Chance of any error among all.
+    """
+    chance = [
+        float(stats.ttest_1samp(one, 0.0).pvalue) if len(one) > 1 and np.ptp(one) > 0 else np.nan
+        for one in samples
+    ]
+    order = [index for index in np.argsort(chance) if not np.isnan(chance[index])]
+    sure = [False] * len(samples)
+    for rank, index in enumerate(order):
+        if chance[index] > level / (len(order) - rank):
+            break
+        sure[index] = True
+    return sure
 
 
 def summary(runs: Mapping[str, pd.DataFrame], *, measure: str = "recovery") -> pd.DataFrame:

@@ -2,13 +2,14 @@
 
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import pandas as pd
 
-from popl_rl.evaluation.statistics import interval, require_columns
+from popl_rl.evaluation.statistics import differs_from_zero, interval, require_columns
 from popl_rl.experiments.markdown import markdown_table
 
 __all__ = [
@@ -29,19 +30,25 @@ _MARKED = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 @dataclass(frozen=True)
 class ResultTable:
-    """One measure of methods (rows) in scenarios (columns), for the group served worst.
+    """One measure of methods (rows) in scenarios (columns).
 
     Attributes:
         suite: The suite whose rows it shows.
         measure: The measure, as in ``results.csv``.
         methods: ``(method, choice)`` -> what the row is called.
         scenarios: Scenario -> what the column is called.
+        over: Of which group: the one served ``"worst"``, the ``"mean"`` over groups, or ``"all"``,
+            for measures of all groups together.
+        against: Method and choice that the others are subtracted from, seed by seed; None to show
+            them as they are.
     """
 
     suite: str
     measure: str
     methods: Mapping[tuple[str, str], str]
     scenarios: Mapping[str, str]
+    over: Literal["worst", "mean", "all"] = "worst"
+    against: tuple[str, str] | None = None
 
     def rows(self, results: pd.DataFrame) -> pd.DataFrame:
         """Rows that the table is made from.
@@ -55,10 +62,11 @@ class ResultTable:
         Raises:
             ValueError: If ``results`` lacks a column.
         """
-        rows = _rows_of(results, self.suite, self.methods)
+        methods = [*self.methods, *([] if self.against is None else [self.against])]
+        rows = _rows_of(results, self.suite, methods)
         return rows[
             (rows["measure"] == self.measure)
-            & (rows["group"] != "all")
+            & ((rows["group"] == "all") == (self.over == "all"))
             & rows["scenario"].isin(list(self.scenarios))
         ]
 
@@ -69,19 +77,49 @@ class ResultTable:
             results: Rows with the columns ``COLUMNS``.
 
         Returns:
-            The table; a cell is mean ± 95 % interval over seeds [lowest], or – without rows.
+            The table; a cell is mean ± 95 % interval over seeds [lowest], or – without rows. With
+            ``against``, mean of the differences ± 95 % interval, and an asterisk where it is not 0
+            at a level of 5 % for all cells together (Holm, 1979; t-tests paired over seeds).
 
         Raises:
             ValueError: If ``results`` lacks a column.
         """
-        rows = self.rows(results)
-        lines = []
-        for (method, choice), label in self.methods.items():
-            own = rows[(rows["method"] == method) & (rows["choice"] == choice)]
-            cells = [_cell(own[own["scenario"] == scenario]) for scenario in self.scenarios]
-            lines.append([label, *cells])
+        key = ["method", "choice", "scenario", "seed"]
+        by_seed = self.rows(results).groupby(key)["value"]
+        value = (by_seed.min() if self.over == "worst" else by_seed.mean()).to_dict()
+        places = [(entry, scenario) for entry in self.methods for scenario in self.scenarios]
+        cells = dict(zip(places, self._cells(value, places), strict=True))
+        lines = [
+            [label, *(cells[entry, scenario] for scenario in self.scenarios)]
+            for entry, label in self.methods.items()
+        ]
         head = ["method", *self.scenarios.values()]
         return markdown_table(head, lines, right=len(self.scenarios))
+
+    def _cells(
+        self,
+        value: Mapping[tuple[str, str, str, int], float],
+        places: Sequence[tuple[tuple[str, str], str]],
+    ) -> list[str]:
+        """A cell for each method and scenario, from a value for each seed."""
+
+        def seeds(entry: tuple[str, str], scenario: str) -> dict[int, float]:
+            return {
+                key[3]: number for key, number in value.items() if key[:3] == (*entry, scenario)
+            }
+
+        found = [seeds(entry, scenario) for entry, scenario in places]
+        if self.against is None:
+            return [_cell(list(own.values())) for own in found]
+        other = [seeds(self.against, scenario) for _, scenario in places]
+        pairs = [
+            [own[seed] - its[seed] for seed in own.keys() & its.keys()]
+            for own, its in zip(found, other, strict=True)
+        ]
+        return [
+            _difference(one, sure)
+            for one, sure in zip(pairs, differs_from_zero(pairs), strict=True)
+        ]
 
 
 @dataclass(frozen=True)
@@ -135,9 +173,7 @@ class PeopleTable:
         return markdown_table(["method", *self.columns.values()], lines, right=len(self.columns))
 
 
-def _rows_of(
-    results: pd.DataFrame, suite: str, methods: Mapping[tuple[str, str], str]
-) -> pd.DataFrame:
+def _rows_of(results: pd.DataFrame, suite: str, methods: Iterable[tuple[str, str]]) -> pd.DataFrame:
     """Rows of a suite, and of methods by their names and choices."""
     require_columns(results, COLUMNS)
     # Without a single choice, pandas reads the column as numbers.
@@ -174,7 +210,7 @@ def read_tables(path: Path) -> dict[str, ResultTable | PeopleTable]:
         path: A TOML file with a section for each table: ``suite``, ``measure``, ``methods`` (a list
             of ``[method, choice, label]``) and ``scenarios`` (name = title); or, of real people,
             ``columns`` (a list of ``[group, measure, title]``) in the place of ``measure`` and
-            ``scenarios``.
+            ``scenarios``. ``over`` and ``against`` as in `ResultTable`.
 
     Returns:
         The tables by name.
@@ -191,8 +227,14 @@ def read_tables(path: Path) -> dict[str, ResultTable | PeopleTable]:
                 columns = {(group, measure): title for group, measure, title in about["columns"]}
                 tables[name] = PeopleTable(about["suite"], methods, columns)
                 continue
+            against = about.get("against")
             tables[name] = ResultTable(
-                about["suite"], about["measure"], methods, about["scenarios"]
+                about["suite"],
+                about["measure"],
+                methods,
+                about["scenarios"],
+                over=about.get("over", "worst"),
+                against=None if against is None else (against[0], against[1]),
             )
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(
@@ -266,13 +308,20 @@ def fill_tables(text: str, tables: Mapping[str, str]) -> str:
     return _MARKED.sub(lambda match: f"{match[1]}{tables[match[2]]}\n{match[3]}", text)
 
 
-def _cell(rows: pd.DataFrame) -> str:
-    worst = rows.groupby("seed")["value"].min()
-    if worst.empty:
+def _cell(values: Sequence[float]) -> str:
+    if not values:
         return "–"
-    mean, half = interval(worst.to_numpy())
-    spread = f" ± {half:.2f}" if len(worst) > 1 else ""
-    return f"{_number(mean)}{spread} [{_number(float(worst.min()))}]"
+    mean, half = interval(values)
+    spread = f" ± {half:.2f}" if len(values) > 1 else ""
+    return f"{_number(mean)}{spread} [{_number(min(values))}]"
+
+
+def _difference(values: Sequence[float], sure: bool) -> str:
+    if not values:
+        return "–"
+    mean, half = interval(values)
+    spread = f" ± {half:.2f}" if len(values) > 1 else ""
+    return f"{_number(mean)}{spread}{'*' if sure else ''}"
 
 
 def _number(value: float) -> str:

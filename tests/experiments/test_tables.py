@@ -1,6 +1,7 @@
 import pandas as pd
 import pytest
 
+from popl_rl.evaluation.statistics import differs_from_zero
 from popl_rl.experiments.tables import (
     COLUMNS,
     ResultTable,
@@ -84,3 +85,35 @@ def test_only_rows_that_a_table_shows_are_kept(described):
 def test_a_suite_that_was_not_run_has_empty_cells(described):
     made = make_tables(read_tables(described), described.parent)
     assert made["t"].endswith("| pooled CPL | – |")
+
+
+def test_differences_are_paired_over_seeds():
+    """Means over groups 0.5, 0.7 and 0.9 against 0.4, 0.5 and 0.6: differences 0.1, 0.2, 0.3."""
+    rows = [
+        ("s", "two", seed, method, "", group, "recovery", value + shift)
+        for method, values in [("popl", [0.5, 0.7, 0.9]), ("em", [0.6, 0.5, 0.4])]
+        for seed, value in zip((0, 1, 2) if method == "popl" else (2, 1, 0), values, strict=True)
+        for group, shift in [("a", 0.1), ("b", -0.1)]
+    ]
+    table = ResultTable(
+        "s", "recovery", {("popl", ""): "`popl`"}, {"two": "two"}, over="mean", against=("em", "")
+    )
+    text = table.markdown(pd.DataFrame(rows, columns=COLUMNS))
+    assert text.endswith("| `popl` | 0.20 ± 0.25 |")  # t(0.975, 2) = 4.303 times 0.1 / sqrt(3)
+
+
+def test_measures_of_all_groups_together():
+    rows = [
+        ("s", "two", seed, "popl", "", group, "distinct", value)
+        for seed, group, value in [(0, "all", 4), (0, "a", 9), (1, "all", 6)]
+    ]
+    table = ResultTable("s", "distinct", {("popl", ""): "`popl`"}, {"two": "two"}, over="all")
+    assert "5.00 ± 12.71 [4.00]" in table.markdown(pd.DataFrame(rows, columns=COLUMNS))
+
+
+def test_what_differs_is_judged_together():
+    """P-values of 0.003 and 0.026: at 2 % for both, the first has to be below 1 %, the other 2 %."""
+    clear, weak = [1.0, 1.1, 0.9], [0.5, 0.9, 0.7]
+    assert differs_from_zero([clear, weak, [0.1], []]) == [True, True, False, False]
+    assert differs_from_zero([clear, weak], level=0.02) == [True, False]
+    assert differs_from_zero([[0.2, 0.2]]) == [False]  # no spread, no test
