@@ -1,6 +1,7 @@
 """Steps of a run that learns from real people, as ``popl-train`` and ``popl-people`` take them."""
 
 import shutil
+import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -23,8 +24,9 @@ from popl_rl.experiments.people_report import people_alarm, write_people_report
 from popl_rl.experiments.people_training import Trained, judge_fold, train_on
 from popl_rl.experiments.progress import Progress
 from popl_rl.experiments.run_manifest import check_own_data, run_id
+from popl_rl.manifest import digest_of_bytes, read_sealed, sealed
 from popl_rl.models.hypothesis_set import HypothesisSet
-from popl_rl.storage import write_atomic
+from popl_rl.storage import write_atomic, write_json
 
 __all__ = ["REFERENCES", "compare_methods", "evolve_people", "finish_people", "read_people"]
 
@@ -126,19 +128,45 @@ def compare_methods(
             fold = split(people, config.people, number, ties=config.method.ties, seed=config.seed)
             for name in methods:
                 path = cells / f"{name}-{number}.csv"
-                if not path.is_file():
+                if not _is_whole(path):
                     trained = known(name, number) or train_on(people, fold, config, name, run=train)
                     if trained.found is not None:
                         shutil.rmtree(cells / f"{name}-{number}", ignore_errors=True)
                         trained.found.save(cells / f"{name}-{number}")
                     table = judge_fold(people, fold, trained, config.people, seed=config.seed)
-                    write_atomic(path, table.to_csv(index=False))
+                    content = table.to_csv(index=False)
+                    write_json(_record(path), sealed({"table": digest_of_bytes(content.encode())}))
+                    write_atomic(path, content)
                 text = {"choice": "str", "person": "str", "group": "str"}
                 table = pd.read_csv(path, dtype=text, keep_default_na=False)
                 tables.append(table.astype({"accuracy": float, "log_likelihood": float}))
                 done += 1
                 progress.update(done)
     return pd.concat(tables)[PERSON_COLUMNS]
+
+
+def _record(path: Path) -> Path:
+    """File that knows the digest of a table."""
+    return path.with_suffix(".json")
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether there is a table, as it was written; one that was damaged is made again, as is told.
+
+    Tables of earlier versions have no record.
+    """
+    if not path.is_file():
+        return False
+    if not _record(path).exists():
+        return True
+    try:
+        record = read_sealed(_record(path), cure="it is made again")
+        if record.get("table") != digest_of_bytes(path.read_bytes()):
+            raise ValueError(f"{path} was changed after it was written; it is made again")
+    except (OSError, ValueError) as error:
+        warnings.warn(str(error), stacklevel=2)
+        return False
+    return True
 
 
 def finish_people(

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from popl_rl.manifest import digest_of_bytes
 
-__all__ = ["FOLDER", "find_plug_ins", "keep_plug_ins"]
+__all__ = ["FOLDER", "find_plug_ins", "keep_plug_ins", "plug_in_digests"]
 
 FOLDER = "plug_ins"
 """Folder of a run for the copies."""
@@ -51,6 +51,14 @@ def keep_plug_ins(run_dir: Path, config: Any) -> dict[str, Any]:
             copies[file.name] = _digest(folder / file.name)
         kept[named] = {"folder": str(folder.relative_to(run_dir)), "files": copies}
     return kept
+
+
+def plug_in_digests(config: Any) -> dict[str, str | None]:
+    """Digests of the files that settings name as plug-ins, and of what they import, by name."""
+    files = [Path(named).expanduser().resolve() for named in sorted(_named(config))]
+    return {
+        file.name: _digest(file) for each in files if each.is_file() for file in _with_imports(each)
+    }
 
 
 def find_plug_ins(run_dir: Path, config: DictConfig, kept: Mapping[str, Any]) -> DictConfig:

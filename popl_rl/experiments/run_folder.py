@@ -102,16 +102,25 @@ def create_run_dir(
                 continue
             return folder
         raise FileExistsError(f"{base} and 998 folders like it exist; choose run_dir=<dir>")
+    taken = FileExistsError(
+        f"run_dir {path} exists and is not empty; choose another run_dir, or continue that run "
+        f"with resume={path}"
+    )
     if path.exists() and (not path.is_dir() or _holds_something(path)):
-        raise FileExistsError(
-            f"run_dir {path} exists and is not empty; choose another run_dir, or continue that run "
-            f"with resume={path}"
-        )
+        raise taken
     if path.exists():  # empty, and perhaps a disk of its own
-        fill(path)
-    else:
+        with in_use(path):
+            if _holds_something(path):  # another process was faster
+                raise taken
+            fill(path)
+        return path
+    try:
         with written_beside(path) as beside:
             fill(beside)
+    except OSError as error:
+        if error.errno in (errno.EEXIST, errno.ENOTEMPTY):
+            raise taken from error
+        raise
     return path
 
 

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from popl_rl.locks import locked
+from popl_rl.manifest import read_json
 
 __all__ = ["FeatureCache", "language_model_features", "pool", "tfidf_features"]
 
@@ -145,7 +146,7 @@ class FeatureCache:
         about = path / "about.json"
         if not keys or not about.is_file():
             return
-        width = int(json.loads(about.read_text())["features"])
+        width = int(read_json(about, cure=f"remove {path} to read the texts again")["features"])
         size = (path / "rows.float32").stat().st_size // (4 * width)
         count = min(len(keys), size)
         held = np.memmap(path / "rows.float32", np.float32, "r", shape=(count, width))

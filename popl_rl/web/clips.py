@@ -21,6 +21,7 @@ import imageio.v3
 import numpy as np
 from numpy.typing import NDArray
 
+from popl_rl.manifest import read_json
 from popl_rl.storage import write_atomic
 
 __all__ = ["Clip", "Clips", "film_strip", "read_clip", "write_clip"]
@@ -99,6 +100,6 @@ def read_clip(folder: Path, index: int) -> Clip | None:
     about = folder / f"{index}.json"
     if not about.is_file():
         return None
-    known = json.loads(about.read_text(encoding="utf-8"))
+    known = read_json(about, cure="remove it to draw the clip again")
     strip = (folder / f"{index}.webp").read_bytes() if known["frames"] else b""
     return Clip(known["frames"], known["rate"], strip, known["text"])

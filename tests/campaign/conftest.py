@@ -7,8 +7,11 @@ should.
 
 import os
 import random
+import signal
 import sys
 import time
+import traceback
+import warnings
 from dataclasses import dataclass
 
 import pytest
@@ -86,3 +89,55 @@ def train(monkeypatch, tmp_path, capsys):
         return Outcome(code, "".join(capsys.readouterr()), time.monotonic() - started)
 
     return run
+
+
+@pytest.fixture
+def child(tmp_path):
+    """Runs ``popl-train`` in a fork of this process: exit code (negative: a signal), and its text.
+
+    ``before`` is called in the child; ``after`` are seconds until it is killed.
+    """
+
+    def start(*overrides, before=lambda: None):
+        told = tmp_path / f"told-{time.monotonic_ns()}.txt"
+        sys.stdout.flush()
+        sys.stderr.flush()
+        process = os.fork()
+        if process == 0:
+            _train_and_leave(told, overrides, before)
+        return process, told
+
+    def wait(process, told):
+        status = os.waitpid(process, 0)[1]
+        return os.waitstatus_to_exitcode(status), told.read_text() if told.exists() else ""
+
+    def run(*overrides, before=lambda: None, after=None):
+        process, told = start(*overrides, before=before)
+        if after is not None:
+            time.sleep(after)
+            os.kill(process, signal.SIGKILL)
+        return wait(process, told)
+
+    run.start, run.wait = start, wait
+    return run
+
+
+def _train_and_leave(told, overrides, before):
+    code = 1
+    try:
+        file = os.open(told, os.O_CREAT | os.O_WRONLY)
+        for number in (1, 2):
+            os.dup2(file, number)
+        sys.stdout = open(1, "w", buffering=1, closefd=False)  # noqa: SIM115
+        sys.stderr = open(2, "w", buffering=1, closefd=False)  # noqa: SIM115
+        warnings.resetwarnings()
+        sys.argv = ["popl-train", *overrides]
+        before()
+        train_popl.cli()
+        code = 0
+    except SystemExit as leave:
+        code = leave.code or 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        os._exit(code)

@@ -11,7 +11,7 @@ from popl_rl.config import (
 )
 from popl_rl.data.environments import behaviour_shares
 from popl_rl.data.segments import collect_segments
-from popl_rl.experiments.data import build_groups, build_world, make_data
+from popl_rl.experiments.data import build_groups, build_world, describe, make_data
 from popl_rl.keys import ANSWER, GROUP, PAIR, RATER, UTILITY
 from popl_rl.models.policies import PolicySpec
 from popl_rl.randomness import stream
@@ -277,3 +277,13 @@ def test_foreign_data_are_refused(world, tiny_groups, tmp_path, collect):
     save_tensordict(TensorDict({"observation": torch.zeros(30, 4, 5)}, [30]), tmp_path / "segments")
     with pytest.raises(ValueError, match="does not hold what was expected: 'action'"):
         collect(world, tiny_groups, load=tmp_path)
+
+
+def test_segments_of_a_world_whose_file_has_changed_are_collected_again(tmp_path):
+    (tmp_path / "walk.py").write_text(WALK)
+    env, data = EnvConfig(factory=f"{tmp_path}/walk.py:Walk"), DataConfig()
+    before = describe(env, data, seed=0)
+    assert describe(env, data, seed=0) == before
+    (tmp_path / "walk.py").write_text(WALK + "# changed")
+    assert describe(env, data, seed=0) != before
+    assert "plug_ins" not in describe(EnvConfig(), data, seed=0)

@@ -134,7 +134,10 @@ def test_methods_are_compared_and_a_killed_comparison_goes_on(config_of, importe
     assert kept["popl", "posterior", "all", "people@0"] == 24
     (tmp_path / "run" / "cells" / "em-1.csv").unlink()
     (tmp_path / "run" / "results.csv").unlink()
-    again = judge_people.run(config_of(f"resume={tmp_path / 'run'}", name="people"))
+    damaged = tmp_path / "run" / "cells" / "popl-0.csv"
+    damaged.write_text("".join(damaged.read_text().splitlines(keepends=True)[:-3]))
+    with pytest.warns(UserWarning, match=r"popl-0\.csv was changed .* it is made again"):
+        again = judge_people.run(config_of(f"resume={tmp_path / 'run'}", name="people"))
     pd.testing.assert_frame_equal(again.results, result.results)
 
 
