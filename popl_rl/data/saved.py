@@ -60,7 +60,12 @@ def load_segments(path: Path, *, required: Mapping[str, int] | None = None) -> T
         FileNotFoundError: If there is no such folder.
         ValueError: If it is damaged, was changed, or holds something else.
     """
-    data = load_tensordict(path, required={OBSERVATION: 3, ACTION: 2, **(required or {})})
+    digest = None
+    if read_manifest(path) is None:  # what answers are about is also known beside them
+        beside = read_manifest(path.parent / "preferences")
+        digest = None if beside is None else beside["about"].get("segments")
+    needs = {OBSERVATION: 3, ACTION: 2, **(required or {})}
+    data = load_tensordict(path, required=needs, digest=digest)
     data.auto_batch_size_(2)
     check_segments(data, path)
     return data
@@ -82,6 +87,11 @@ def load_preferences(
         FileNotFoundError: If there is no such folder.
         ValueError: If it is damaged, was changed, or compares other segments.
     """
+    if read_manifest(path) is None and read_manifest(path.parent / "segments") is not None:
+        raise ValueError(
+            f"{path} has no manifest.json, but the segments beside it have one: it was removed, or "
+            "these preferences are others; restore the folder, or collect it again"
+        )
     ids = {RATER: 1} if named else {}
     data = load_tensordict(path, required={PAIR: 2, ANSWER: 1, **ids})
     manifest = read_manifest(path)
