@@ -28,6 +28,7 @@ from popl_rl.data.saved import (
 from popl_rl.data.segments import collect_segments, segment_buffer, stored_segments
 from popl_rl.data.store import store_path, stored
 from popl_rl.experiments.asked import check_asked, write_groups
+from popl_rl.experiments.plug_ins import plug_in_digests
 from popl_rl.keys import GROUP, INFO, OBSERVATION
 from popl_rl.manifest import digest_of_tensors
 from popl_rl.randomness import stream
@@ -180,7 +181,10 @@ def describe(env: EnvConfig, config: DataConfig, *, seed: int) -> dict[str, Any]
     node = env if isinstance(env, DictConfig) else OmegaConf.structured(env)
     described: Any = OmegaConf.to_container(node, resolve=True)
     described["mixture"] = described["mixture"] or None  # both are equal shares
+    # A file of one's own may be changed; what is installed has a version that somebody chose.
+    own = plug_in_digests(described)
     return {
+        **({"plug_ins": own} if own else {}),
         "format": 1,
         "env": {name: described[name] for name in names},
         "segments": config.segments,
