@@ -95,7 +95,7 @@ class NicheSettings:
     searches: int = 3  # searches side by side; each rater is held out of one of them
     specialists: int = 256  # raters, at most, for each of whom a specialist may be a founder
     selections: int = 6  # times in a search that unneeded members make room for children
-    settled: float = 0.55  # share of the generations after which the size is chosen
+    settled: float = 0.55  # generations of the searches, in those that the fresh members have
     evidence: float = 0.5  # standard errors by which a smaller set may predict raters worse
 
     def check(self, at: Checker) -> None:

@@ -5,7 +5,7 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 import pandas as pd
 
@@ -86,7 +86,8 @@ class ResultTable:
         """
         key = ["method", "choice", "scenario", "seed"]
         by_seed = self.rows(results).groupby(key)["value"]
-        value = (by_seed.min() if self.over == "worst" else by_seed.mean()).to_dict()
+        each = by_seed.min() if self.over == "worst" else by_seed.mean()
+        value = cast("dict[tuple[str, str, str, int], float]", each.to_dict())
         places = [(entry, scenario) for entry in self.methods for scenario in self.scenarios]
         cells = dict(zip(places, self._cells(value, places), strict=True))
         lines = [
