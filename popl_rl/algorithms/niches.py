@@ -4,8 +4,8 @@ Several searches (see ``popl_rl.algorithms.niche_search``) run side by side, and
 out of one. In the first part of a search, members divide the raters among themselves, and lexicase
 selects the parents of new members. In the second, populations of several sizes train on. The raters
 who were held out tell which size predicts people whom it has not learnt of best, and the smallest
-that is hardly worse is taken. At last, fresh members are trained by the whole recipe on the division of
-the raters that was found: what was learnt while it was wrong would stay with the members otherwise.
+that is hardly worse is taken. At last, fresh members are trained by the whole recipe on the
+division of the raters that was found: what was learnt while it was wrong would stay otherwise.
 """
 
 import warnings
@@ -43,7 +43,7 @@ class NichePOPL:
 
     Attributes:
         generation: Generations done so far.
-        generations: Generations after which it is finished: those of the searches, and the problem's.
+        generations: Generations after which it is finished: of the searches, and the problem's.
         sizes: What was compared, ``(members, mean log-likelihood of held-out raters' answers,
             standard error of how far that is behind the best, paired over raters)``; empty before.
 

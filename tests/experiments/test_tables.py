@@ -112,7 +112,7 @@ def test_measures_of_all_groups_together():
 
 
 def test_what_differs_is_judged_together():
-    """P-values of 0.003 and 0.026: at 2 % for both, the first has to be below 1 %, the other 2 %."""
+    """P-values of 0.003 and 0.026: at 2 % for both, the lower must be below 1 %, the other 2 %."""
     clear, weak = [1.0, 1.1, 0.9], [0.5, 0.9, 0.7]
     assert differs_from_zero([clear, weak, [0.1], []]) == [True, True, False, False]
     assert differs_from_zero([clear, weak], level=0.02) == [True, False]
