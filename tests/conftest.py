@@ -3,6 +3,7 @@
 import pytest
 import torch
 from hydra import compose, initialize_config_module
+from hydra.core.hydra_config import HydraConfig
 
 import popl_rl.trainers.run_benchmark
 import popl_rl.trainers.train_popl  # noqa: F401 - they make the schemas known to Hydra
@@ -51,6 +52,13 @@ def pytest_addoption(parser):
         action="store_true",
         help="rewrite tests/golden/*.json with what the tests now get",
     )
+
+
+@pytest.fixture(autouse=True)
+def no_command_line_left():
+    """What one test has typed is not what the next one has."""
+    yield
+    HydraConfig.instance().cfg = None
 
 
 @pytest.fixture(scope="session")

@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 
 from popl_rl.config import plain, validate
 from popl_rl.experiments.cells import Cell, is_finished, results_digest
+from popl_rl.experiments.progress import without_lines
 from popl_rl.locks import HeldError, locked
 from popl_rl.manifest import sealed
 from popl_rl.storage import write_json
@@ -71,6 +72,7 @@ def run_task(task: Task) -> str | None:
             log.open("w", encoding="utf-8") as file,
             contextlib.redirect_stdout(file),
             contextlib.redirect_stderr(file),
+            without_lines(),
         ):
             try:
                 # Another machine may have run it while this one waited.

@@ -5,7 +5,7 @@ import time
 
 from popl_rl.algorithms.problem import Method
 from popl_rl.config import Config, MethodConfig
-from popl_rl.experiments.progress import in_words
+from popl_rl.experiments.progress import in_words, is_told
 
 __all__ = ["Foresight", "last_training"]
 
@@ -44,7 +44,7 @@ class Foresight:
         now = time.monotonic()
         seconds, self.began = now - self.began, now
         # The first one also loads what is needed for the first time: it is asked if it is long.
-        if self.was_told or (self.timed == 1 and seconds < _LONG):
+        if self.was_told or not is_told() or (self.timed == 1 and seconds < _LONG):
             return
         self.was_told = True
         total, parts = self.ahead(generation, seconds)

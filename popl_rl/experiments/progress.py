@@ -2,6 +2,9 @@
 
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from types import TracebackType
 from typing import Self
 
@@ -9,9 +12,25 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
 
-__all__ = ["Progress", "in_words"]
+__all__ = ["Progress", "in_words", "is_told", "without_lines"]
 
+_TOLD: ContextVar[bool] = ContextVar("told", default=True)
 _EVERY = 10.0  # seconds between two lines of a phase
+
+
+@contextmanager
+def without_lines() -> Iterator[None]:
+    """Have no lines written in this context: a benchmark's cell keeps its log for warnings."""
+    before = _TOLD.set(False)
+    try:
+        yield
+    finally:
+        _TOLD.reset(before)
+
+
+def is_told() -> bool:
+    """Whether lines are to be written where there is no terminal."""
+    return _TOLD.get()
 
 
 class Progress:
@@ -50,7 +69,8 @@ class Progress:
             disable=not console.is_terminal,
         )
         self._task = self._bar.add_task(description, total=total, completed=completed, metrics="")
-        self._lines = None if console.is_terminal else _Lines(description, total)
+        in_lines = is_told() and not console.is_terminal
+        self._lines = _Lines(description, total) if in_lines else None
 
     def update(self, completed: int, **fields: float) -> None:
         """Show how far it is.

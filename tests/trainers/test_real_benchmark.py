@@ -68,6 +68,10 @@ def test_a_real_benchmark_in_a_worker_process(tiny, capfd):
         "pooled_cpl",
         "oracle",
         "random",
+        "optimum",
+        "behaviour",
+        "best_behaviour",
+        "data",
     }
     first, other = (cell_folder(f"plain/{name}/seed0") for name in ("popl", "other"))
     assert (first / "data").is_dir()

@@ -68,12 +68,14 @@ def equal(one, other):
 def test_a_run_leaves_everything_behind(result):
     found = {path.name for path in result.run_dir.iterdir()}
     assert found == {
+        ".lock",
         "baselines",
         "checkpoint",
         "config.yaml",
         "data",
         "figures",
         "history.csv",
+        "manifest.json",
         "metadata.json",
         "metrics.csv",
         "policies",
