@@ -157,6 +157,18 @@ class NicheSearch:
         """The population of one size, without members that serve nobody."""
         return self.stack.subset(self.members_of(index))
 
+    def largest(self) -> Population:
+        """The population of the largest size, as ``problem.members`` members.
+
+        The first ones come again where there are fewer: tables have a column for each member.
+        """
+        members = range(len(self.stack))[self._parts()[-1]]
+        return self.stack.subset([members[i % len(members)] for i in range(self.problem.members)])
+
+    def share_of_largest(self) -> Tensor:
+        """Share of the raters that each of its members serves, summing to 1."""
+        return self.share[self._parts()[-1]]
+
     def _parts(self) -> list[slice]:
         """Where the population of each size is in the stack."""
         ends = torch.tensor(self.sizes or [len(self.stack)]).cumsum(0).tolist()

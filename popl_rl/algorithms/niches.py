@@ -108,20 +108,20 @@ class NichePOPL:
         else:
             members = len(self.found.share)
             loss = self._train(self.found)
-        share = self.searches[0].share if self.found is None else self.found.share
+        share = self.searches[0].share_of_largest() if self.found is None else self.found.share
         self.generation += 1
         return {
             "worst_rater_accuracy": rater_accuracy(case_values(passes, comparisons)),
             "mean_accuracy": float(passes.float().mean()),
             "members": float(members),
-            "effective_members": float(share.sum().square() / share.square().sum()),
+            "effective_members": float(1 / share.square().sum()),
             "loss_cpl": loss,
         }
 
     @property
     def population(self) -> Population:
-        """The members as they are now; of the first search while there are several."""
-        return self.searches[0].stack if self.found is None else self.found.stack
+        """The members as they are now; before settling those of the first search's largest size."""
+        return self.searches[0].largest() if self.found is None else self.found.stack
 
     def result(self) -> HypothesisSet:
         """The members that serve somebody, their scale fitted for catering."""

@@ -61,6 +61,7 @@ def test_it_finds_as_many_as_there_are(groups):
     assert len(found) in ((groups,) if groups < 3 else (3, 4))
     assert min(served(found, bank, comparisons, group)) > 0.8
     assert metrics[-1]["members"] >= len(found)
+    assert all(1 <= row["effective_members"] <= 8.01 for row in metrics)
     assert [size for size, _, _ in method.sizes] == [1, 2, 3, 5, 8]
 
 
@@ -106,6 +107,18 @@ def test_children_take_the_places_of_members_that_nobody_needs():
         for one in search.stack.members.data["0", "weight"]
     ]
     assert 1 <= sum(same) <= 9  # three quarters stay at most, children have learnt
+
+
+def test_the_population_is_never_larger_than_it_began():
+    """Tables of each member over generations have the columns of the first one."""
+    bank, comparisons, _ = ring(2, raters=6)
+    method = build(bank, comparisons, steps=60)
+    counts = []
+    for _ in range(method.generations):
+        method.step()
+        counts.append(len(method.population))
+    assert max(counts) == counts[0] <= 8
+    assert method.population is method.found.stack
 
 
 def test_sizes_grow_by_half():

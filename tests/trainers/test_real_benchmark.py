@@ -86,7 +86,9 @@ def test_a_real_benchmark_in_a_worker_process(tiny, capfd):
     assert not list(Path("out/logs").rglob("*.txt")), "no warnings"
     assert Path("out/figures/recovery.png").stat().st_size > 1000
     output = capfd.readouterr()
-    assert output.out == output.err == ""
+    assert output.out == ""
+    # On a slow machine there are lines of progress.
+    assert all(line.startswith("cells: ") for line in output.err.splitlines())
 
 
 @pytest.mark.slow
