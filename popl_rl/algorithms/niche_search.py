@@ -112,9 +112,10 @@ class NicheSearch:
         margin = self.problem.margins(self.stack)[kept]
         values = case_values(margin > 0, self.problem.comparisons)[:, self.raters]
         parents = [kept[parent] for parent in self._select(values, place)]
-        children = personalise(
-            self.problem,
-            self.stack.subset(parents),
+        children = self.stack.subset(parents)
+        personalise(
+            self.problem.loss(children),
+            self.problem.comparisons,
             self.raters[place],
             steps=self.popl.specialist_steps,
             learning_rate=_CHILD_RATE * self.problem.training.learning_rate,

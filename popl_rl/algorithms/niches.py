@@ -149,10 +149,7 @@ class NichePOPL:
         problem = self.problem
         now, last = self.generation - self.settled, self.generations - self.settled
         if now >= _GIVEN * last:
-            likelihood = per_case(
-                problem.likelihood(problem.scores(found.stack)), self.problem.comparisons
-            )
-            found.served = expect(likelihood, found.share).responsibility
+            found.served = self._served(found.stack, found.share)
             found.share = found.served.mean(1)
         found.training.optimizer.param_groups[0]["lr"] = problem.training.learning_rate * decay(
             now, last
@@ -178,12 +175,15 @@ class NichePOPL:
                 stacklevel=2,
             )
         best = max((search.population(chosen) for search in self.searches), key=self._predicts)
-        likelihood = per_case(
-            self.problem.likelihood(self.problem.scores(best)), self.problem.comparisons
-        )
-        share = likelihood.new_full((len(best),), 1 / len(best))
-        served = expect(likelihood, share).responsibility
+        share = value.new_full((len(best),), 1 / len(best))
+        served = self._served(best, share)
         self.found = _Niches(self.problem, served, generator=self.generator)
+
+    def _served(self, population: Population, share: Tensor) -> Tensor:
+        """E-step: how much each member serves each rater, ``[K, C]``."""
+        problem = self.problem
+        likelihood = per_case(problem.likelihood(problem.scores(population)), problem.comparisons)
+        return expect(likelihood, share).responsibility
 
     def _predicts(self, population: Population) -> float:
         """How well a population predicts all raters, most of whom it has learnt of."""

@@ -65,53 +65,48 @@ def specialists(
         discount=loss.discount,
         slip=loss.slip,
     )
-    descend(
+    personalise(
         own,
-        torch.optim.Adam(copies.members.parameters(), lr=learning_rate),
         comparisons,
+        raters,
         steps=steps,
+        learning_rate=learning_rate,
         batch_size=batch_size,
-        weight=(comparisons.case == raters.unsqueeze(1)).float(),
         generator=generator,
     )
     return copies
 
 
 def personalise(
-    problem: Problem,
-    population: Population,
+    loss: CPLLoss,
+    comparisons: Comparisons,
     raters: Tensor,
     *,
     steps: int,
     learning_rate: float,
     batch_size: int,
     generator: torch.Generator,
-) -> Population:
+) -> None:
     """Train each member for a moment on the answers of one rater.
 
     Args:
-        problem: What is to be learnt.
-        population: S members, changed in place.
-        raters: The rater of each, by their cases, ``[S]``.
+        loss: The loss to descend, whose S members are changed in place.
+        comparisons: M strict preferences of C raters.
+        raters: The rater of each member, by their cases, ``[S]``.
         steps: Gradient steps.
         learning_rate: Adam's step size.
         batch_size: Answers per step.
         generator: Source of the batches.
-
-    Returns:
-        The population.
     """
-    comparisons = problem.comparisons
     descend(
-        problem.loss(population),
-        torch.optim.Adam(population.members.parameters(), lr=learning_rate),
+        loss,
+        torch.optim.Adam(loss.population.members.parameters(), lr=learning_rate),
         comparisons,
         steps=steps,
         batch_size=batch_size,
         weight=(comparisons.case == raters.unsqueeze(1)).float(),
         generator=generator,
     )
-    return population
 
 
 def train_specialists(
