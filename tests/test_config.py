@@ -73,6 +73,7 @@ CASES = [
         "method__popl__tournament",
         "method__em__groups",
         "method__vpl__latent",
+        "method__lore__bases",
         "method__clone__code_dim",
         "method__refinement__most",
         "threads",
@@ -108,7 +109,9 @@ CASES = [
     ("method__factory", "", "method.factory must be a reference of a method, got ''"),
     ("method__reads", ["training", "magic"],
      "method.reads must be sections out of training, popl, refinement, niches, mixture, clone, em, "
-     "vpl, got ['magic']"),
+     "vpl, lore, kmeans, got ['magic']"),
+    ("method__lore__learning_rate", 0.0, "method.lore.learning_rate must be positive, got 0.0"),
+    ("method__kmeans__most", 1, "method.kmeans.most must be at least 2, got 1"),
     ("method__popl__selection", "",
      "method.popl.selection must be lexicase or a reference, got ''"),
     ("method__vpl__kl", -0.5, "method.vpl.kl must be at least 0, got -0.5"),

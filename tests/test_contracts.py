@@ -31,6 +31,7 @@ QUICK = [
     "method.popl.warm_up=3",
     "method.refinement.steps=20",
     "method.em.groups=2",
+    "method.kmeans.groups=2",
 ]
 
 

@@ -28,6 +28,11 @@ METHODS = {
     "em of style codes": {"evolve": "code", **EM},
     "em of reward functions": {"learns": "reward", **EM},
     "vpl": VPL,
+    "lore": {"factory": "popl_rl.algorithms.lore:LoRe", "reads": ["training", "lore"]},
+    "kmeans": {
+        "factory": "popl_rl.algorithms.kmeans:KMeans",
+        "reads": ["training", "popl", "kmeans"],
+    },
     "nsga2": {"popl__selection": "nsga2"},
 }
 #: Short, whatever the method.

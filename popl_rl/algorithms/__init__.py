@@ -10,8 +10,9 @@ Nothing here imports raters: a learner cannot see who voted.
 ``niches``: POPL for any number of groups; ``niche_search``: one of its searches;
 ``specialists``: a member for a rater; ``needed``: which members, and how many, raters need;
 ``stacked_adam``: an optimiser for a population that grows and shrinks.
-``multi_cpl``: CPL ensembles; ``cpl``: pooled CPL and the oracle; ``em``: EM mixtures; ``vpl``: a
-latent variable; ``brex``, ``dpl``, ``reward_baselines``: reward learners that know no groups.
+``multi_cpl``: CPL ensembles; ``cpl``: pooled CPL and the oracle; ``em``: EM mixtures; ``kmeans``:
+clusters of raters first; ``vpl``: a latent variable; ``lore``: low-rank reward functions;
+``brex``, ``dpl``, ``reward_baselines``: reward learners that know no groups.
 ``trainer``: any method as a TorchRL Trainer with checkpoints; ``plugged``: methods and selection
 rules of other people, checked wherever they are called.
 """

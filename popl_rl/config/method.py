@@ -9,6 +9,8 @@ __all__ = [
     "SECTIONS",
     "CloneSettings",
     "EMSettings",
+    "KMeansSettings",
+    "LoReSettings",
     "MethodConfig",
     "MixtureSettings",
     "NicheSettings",
@@ -182,6 +184,39 @@ class VPLSettings:
         at.not_negative(self, "kl")
 
 
+@dataclass
+class LoReSettings:
+    """Low-rank reward functions: bases that all raters share, and each rater's weights of them."""
+
+    bases: int = 8  # of which a rater's hypothesis is a mixture
+    learning_rate: float = 0.1  # of Adam, for the raters' weights; bases have the recipe's
+    fit_steps: int = 100  # in which the weights of a new rater are fitted
+
+    def check(self, at: Checker) -> None:
+        """Report values that are out of range."""
+        at.at_least_one(self, "bases", most=10**4)
+        at.at_least_one(self, "fit_steps")
+        at.positive(self, "learning_rate", most=10)
+
+
+@dataclass
+class KMeansSettings:
+    """k-means of raters by how well specialists for some of them explain each."""
+
+    groups: int | None = None  # clusters; null: as many as there are rater groups
+    silhouette: bool = False  # whether the silhouette chooses how many, up to ``most``
+    most: int = 40  # clusters, at most, that the silhouette chooses among
+
+    def check(self, at: Checker) -> None:
+        """Report values that are out of range."""
+        if self.groups is not None:
+            at.at_least_one(self, "groups", most=10**4)
+        at.expect(self.most >= 2, "most", "at least 2", self.most)
+        at.not_negative(self, "most", most=10**4)
+        told = self.groups is not None and self.silhouette
+        at.expect(not told, "groups", "null where the silhouette chooses", self.groups)
+
+
 _POPL = "popl_rl.algorithms.assembly:build_popl"
 
 #: Sections of ``method`` by name: what ``method.reads`` may list.
@@ -194,6 +229,8 @@ SECTIONS = {
     "clone": CloneSettings,
     "em": EMSettings,
     "vpl": VPLSettings,
+    "lore": LoReSettings,
+    "kmeans": KMeansSettings,
 }
 
 
@@ -223,6 +260,8 @@ class MethodConfig:
     clone: CloneSettings = field(default_factory=CloneSettings)
     em: EMSettings = field(default_factory=EMSettings)
     vpl: VPLSettings = field(default_factory=VPLSettings)
+    lore: LoReSettings = field(default_factory=LoReSettings)
+    kmeans: KMeansSettings = field(default_factory=KMeansSettings)
     options: dict[str, Any] = field(default_factory=dict)  # further arguments of the factory
 
     def sections(self) -> list[str]:

@@ -41,6 +41,8 @@ METHODS = {
     "multi_cpl": ReportedMethod("several CPL policies on everybody's answers", "blue"),
     "em": ReportedMethod("EM mixture of CPL policies", "blue"),
     "vpl": ReportedMethod("VPL, latent variable", "blue"),
+    "lore": ReportedMethod("LoRe, low-rank reward functions", "blue"),
+    "kmeans": ReportedMethod("k-means of raters, then CPL", "blue"),
     "pooled_cpl": ReportedMethod("CPL on everybody's answers", "orange", True),
     "bradley_terry": ReportedMethod("Bradley–Terry on everybody's answers", "orange", True),
     "brex": ReportedMethod("B-REX", "", True),
@@ -65,6 +67,7 @@ CHOICES = {
     "mixture": " (mixture)",
     "single": " (best single)",
     "encoder": " (told by its encoder)",
+    "fitted": " (weights fitted)",
     "expectation": "",
     "risk_averse": ", risk-averse",
 }

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
+from popl_rl.algorithms.lore import LoRe
 from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.specialists import specialists
 from popl_rl.algorithms.vpl import VPL
@@ -14,7 +15,7 @@ from popl_rl.evaluation.people import Questions
 from popl_rl.models.population import Population
 from popl_rl.models.preference_likelihood import MISTAKE, log_likelihood
 
-__all__ = ["EncodedPredictor", "IndividualPredictor"]
+__all__ = ["EncodedPredictor", "IndividualPredictor", "MixedPredictor"]
 
 _CHUNK = 128  # people whose hypotheses are in memory at once
 
@@ -138,6 +139,27 @@ class EncodedPredictor(_OwnHypothesis):
                 self.method.problem.bank, said.preferred[rows], said.other[rows]
             )[0]
         return self.method.policies_for(z)
+
+
+class MixedPredictor(_OwnHypothesis):
+    """Low-rank reward functions: the weights of a person are fitted to the person's answers.
+
+    Args:
+        method: LoRe, trained.
+        comparisons: The answers that questions refer to.
+        scale: Factor of the margins.
+    """
+
+    def __init__(self, method: LoRe, comparisons: Comparisons, *, scale: float = 1.0) -> None:
+        super().__init__(method.problem, comparisons, scale=scale)
+        self.method = method
+
+    def _population(self, questions: Questions, trials: slice, answers: int) -> Population:
+        asked, told = questions.asked[trials, :answers], questions.told[trials]
+        there = torch.arange(asked.shape[1]) < told.unsqueeze(1)
+        said = self.comparisons
+        weights = self.method.fit(said.preferred[asked], said.other[asked], there)
+        return self.method.mixtures(weights)
 
 
 def _chunks(total: int) -> Iterator[slice]:

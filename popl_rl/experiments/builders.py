@@ -159,6 +159,8 @@ def build_method(
     }
     if "em" in sections and config.em.groups is None:
         sections["em"] = replace(config.em, groups=num_groups)
+    if "kmeans" in sections and config.kmeans.groups is None and not config.kmeans.silhouette:
+        sections["kmeans"] = replace(config.kmeans, groups=num_groups)
     try:
         method = factory(problem, generator=generator, **sections, **config.options)
     except TypeError as error:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from popl_rl.algorithms.cpl import GroupCPL, train
 from popl_rl.algorithms.expectation import expect
+from popl_rl.algorithms.lore import LoRe
 from popl_rl.algorithms.problem import Method, Problem
 from popl_rl.algorithms.vpl import VPL
 from popl_rl.config import Config, MethodConfig, PeopleConfig
@@ -24,7 +25,7 @@ from popl_rl.evaluation.people import (
     draw_questions,
     judge,
 )
-from popl_rl.evaluation.people_models import EncodedPredictor, IndividualPredictor
+from popl_rl.evaluation.people_models import EncodedPredictor, IndividualPredictor, MixedPredictor
 from popl_rl.evaluation.people_statistics import PERSON_COLUMNS
 from popl_rl.experiments.builders import build_method, build_problem
 from popl_rl.experiments.people import Fold, People
@@ -114,6 +115,8 @@ def train_on(
     spec = people.spec
     if "vpl" in settings.sections() and not spec.hidden and not spec.output_bias:
         spec = replace(spec, hidden=_VPL_HIDDEN)  # z is added to the inputs of a hidden layer
+    if settings.kmeans.groups is None:  # nobody knows how many groups people are of
+        settings = replace(settings, kmeans=replace(settings.kmeans, silhouette=True))
     problem = build_problem(settings, spec, people.bank, fold.training)
     generator = stream(config.seed, f"people/{fold.number}/{name}")
     if name == "oracle":
@@ -139,16 +142,24 @@ def train_on(
         return _best_em(people, fold, config, settings, problem, generator, run)
     method = build_method(settings, problem, num_groups=2, generator=generator)
     found = run(method)
-    if isinstance(method, VPL):
-        encoded = EncodedPredictor(method, fold.validation)
-        validation = _all_questions(fold.validation)
-        most = int(validation.told.max())
-        margin = encoded.margins(validation, most)[validation.mask]
-        scale = _scale_of_margins(margin)
-        return Trained(
-            name, {"encoder": EncodedPredictor(method, people.answers, scale=scale)}, found
-        )
+    if isinstance(method, VPL | LoRe):
+        return Trained(name, _told_by_answers(method, people, fold), found)
     return as_trained(name, found, people, fold)
+
+
+def _told_by_answers(method: VPL | LoRe, people: People, fold: Fold) -> dict[str, Predictor]:
+    """A hypothesis for each person, told by an encoder, or with weights fitted to the answers."""
+
+    def predictor(answers: Comparisons, scale: float) -> EncodedPredictor | MixedPredictor:
+        if isinstance(method, LoRe):
+            return MixedPredictor(method, answers, scale=scale)
+        return EncodedPredictor(method, answers, scale=scale)
+
+    validation = _all_questions(fold.validation)
+    told = predictor(fold.validation, 1.0).margins(validation, int(validation.told.max()))
+    scale = _scale_of_margins(told[validation.mask])
+    choice = "fitted" if isinstance(method, LoRe) else "encoder"
+    return {choice: predictor(people.answers, scale)}
 
 
 _SINGLE = ("pooled_cpl", "individual", "oracle")

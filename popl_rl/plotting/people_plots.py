@@ -12,10 +12,11 @@ _COLOURS = {
     "popl": "blue",
     "em": "vermilion",
     "vpl": "green",
+    "lore": "sky",
     "pooled_cpl": "orange",
     "individual": "purple",
 }
-_LINES = {"posterior": "-", "mixture": "--", "single": ":", "": "-", "encoder": "-"}
+_LINES = {"posterior": "-", "mixture": "--", "single": ":", "": "-", "encoder": "-", "fitted": "-"}
 
 
 def people_curves(results: pd.DataFrame, *, group: str = "all") -> Figure:

@@ -16,6 +16,8 @@ from popl_rl.algorithms.problem import Method, Problem
 from popl_rl.algorithms.trainer import MethodTrainer
 from popl_rl.config import (
     EMSettings,
+    KMeansSettings,
+    LoReSettings,
     MixtureSettings,
     NicheSettings,
     POPLSettings,
@@ -41,6 +43,8 @@ _SECTIONS: dict[str, Any] = {
     ),
     "em": EMSettings(groups=2),
     "vpl": VPLSettings(),
+    "lore": LoReSettings(bases=3),
+    "kmeans": KMeansSettings(groups=2),
 }
 
 

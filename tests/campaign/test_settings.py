@@ -93,7 +93,17 @@ def test_malformed_settings_are_refused_by_name(part):
 DRAWN = {
     "env": ["two_doors", "hidden_utility", "goal_grid"],
     "raters": ["two_groups", "three_groups", "minority", "identity", "cycle", "goals_4"],
-    "method": ["popl", "popl_niches", "popl_published", "cpl", "multi_cpl", "em", "vpl"],
+    "method": [
+        "popl",
+        "popl_niches",
+        "popl_published",
+        "cpl",
+        "multi_cpl",
+        "em",
+        "vpl",
+        "lore",
+        "kmeans",
+    ],
     "method.cases": ["rater", "preference"],
     "method.ties": ["drop", "count"],
     "method.learns": ["auto", "policy", "reward"],

@@ -91,6 +91,11 @@ METHODS = {
     "cpl": {"factory": "popl_rl.algorithms.multi_cpl:MultiCPL", "reads": ["training"]},
     "em": {"factory": "popl_rl.algorithms.em:EM", "reads": ["training", "em"]},
     "vpl": {"factory": "popl_rl.algorithms.vpl:VPL", "reads": ["training", "vpl"]},
+    "lore": {"factory": "popl_rl.algorithms.lore:LoRe", "reads": ["training", "lore"]},
+    "kmeans": {
+        "factory": "popl_rl.algorithms.kmeans:KMeans",
+        "reads": ["training", "popl", "kmeans"],
+    },
 }
 
 

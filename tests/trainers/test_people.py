@@ -123,13 +123,18 @@ def test_conditions_are_never_read_by_a_learner(config_of, table, tmp_path):
 
 
 def test_methods_are_compared_and_a_killed_comparison_goes_on(config_of, imported, tmp_path):
-    more = [f"data.load={imported}", f"run_dir={tmp_path / 'run'}", "people.methods=[popl,em,vpl]"]
+    more = [
+        f"data.load={imported}",
+        f"run_dir={tmp_path / 'run'}",
+        "people.methods=[popl,em,vpl,lore]",
+    ]
     config = config_of(*SHORT[1:], *more, name="people")
     result = judge_people.run(config)
     kept = result.results.set_index(["method", "choice", "group", "measure"])["value"]
     assert kept["em", "posterior", "all", "accuracy@5"] > 0.8
     assert kept["popl", "posterior", "all", "gain_over_pooled_cpl_low@5"] > 0
     assert math.isfinite(kept["vpl", "encoder", "all", "log_likelihood@5"])
+    assert kept["lore", "fitted", "all", "accuracy@5"] > 0.8
     assert math.isfinite(kept["individual", "", "all", "accuracy@5"])
     assert kept["popl", "posterior", "all", "people@0"] == 24
     (tmp_path / "run" / "cells" / "em-1.csv").unlink()
