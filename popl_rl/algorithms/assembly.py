@@ -19,10 +19,6 @@ from popl_rl.selection.rules import SELECTIONS, Selection, selection_rule
 
 __all__ = ["build_popl", "kind_of_variation"]
 
-#: Raters up to whom each is compared with each: a matrix of 1.6 GB. With more, children learn from
-#: the raters that their parents are strong for, whoever these are.
-_MOST_SIMILAR = 20_000
-
 
 def kind_of_variation(settings: POPLSettings, problem: Problem) -> str:
     """The kind that ``auto`` stands for: gradient with rater ids, mixtures without."""
@@ -95,9 +91,7 @@ def _gradient(
     generator = options["generator"]
     population = _first_heads(problem, popl, generator)
     variation = GradientCPL.of(problem, population, generator=generator)
-    has_ids = not problem.comparisons.is_single
-    few = problem.comparisons.num_cases <= _MOST_SIMILAR
-    if not (popl.rater_similarity and has_ids and few):
+    if not popl.rater_similarity or problem.comparisons.is_single:
         variation.warm_up(popl.warm_up)
         return POPL(problem, population=population, variation=variation, **options)
     if problem.evolve == "head":

@@ -6,6 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from popl_rl.algorithms.draws import Draws, by_comparison
 from popl_rl.algorithms.multi_cpl import MultiCPL
 from popl_rl.algorithms.problem import Method, Problem
 from popl_rl.models.hypothesis_set import HypothesisSet
@@ -53,10 +54,10 @@ class GroupCPL(MultiCPL):
     def __init__(self, problem: Problem, *, weight: Tensor, generator: torch.Generator) -> None:
         population = problem.typical_population(len(weight), generator=generator)
         super().__init__(problem, population=population, generator=generator)
-        self.weight = weight.to(problem.device)
+        self.draws = by_comparison(problem.comparisons, weight.to(problem.device))
 
-    def _weights(self, scores: Tensor) -> tuple[Tensor, dict[str, float]]:  # noqa: ARG002
-        return self.weight, {}
+    def _draws(self, scores: Tensor) -> tuple[Draws, dict[str, float]]:  # noqa: ARG002
+        return self.draws, {}
 
     def result(self) -> HypothesisSet:
         """The K hypotheses, in the order of the weights."""
@@ -90,7 +91,7 @@ def pooled_population(problem: Problem, *, steps: int, generator: torch.Generato
         training=replace(problem.training, steps=steps),
         generations=min(_BLOCKS, steps),
     )
-    weight = torch.ones(1, len(problem.comparisons), device=problem.device)
-    method = GroupCPL(short, weight=weight, generator=generator)
+    population = problem.typical_population(1, generator=generator)
+    method = MultiCPL(short, population=population, generator=generator)
     train(method)
     return method.population

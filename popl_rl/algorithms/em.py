@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from popl_rl.algorithms.draws import Draws, by_case
 from popl_rl.algorithms.expectation import Expectation, expect
 from popl_rl.algorithms.multi_cpl import MultiCPL
 from popl_rl.algorithms.problem import Problem
@@ -51,7 +52,7 @@ class EM(MultiCPL):
         super().__init__(problem, population=population, generator=generator)
         self.share = torch.full((starts, groups), 1 / groups, device=problem.device)
 
-    def _weights(self, scores: Tensor) -> tuple[Tensor, dict[str, float]]:
+    def _draws(self, scores: Tensor) -> tuple[Draws, dict[str, float]]:
         belongs, evidence = self._expect(scores)
         likelihood = evidence.mean(1)
         self.share = belongs.mean(2)
@@ -59,7 +60,7 @@ class EM(MultiCPL):
             "log_likelihood": float(likelihood.max()),
             "smallest_share": float(self.share[likelihood.argmax()].min()),
         }
-        return belongs.flatten(0, 1)[:, self.problem.comparisons.case], about
+        return by_case(self.problem.comparisons, belongs.flatten(0, 1)), about
 
     def _expect(self, scores: Tensor) -> Expectation:
         """Responsibilities ``[R, K, C]`` and evidence ``[R, C]`` of every mixture."""

@@ -5,6 +5,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 
+from popl_rl.algorithms.draws import Draws, uniform
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.population import Population
@@ -169,7 +170,7 @@ def descend(
     *,
     steps: int,
     batch_size: int,
-    weight: Tensor | None = None,
+    draws: Draws | None = None,
     generator: torch.Generator,
 ) -> float:
     """Take gradient steps on the members' CPL losses, all members at once.
@@ -180,25 +181,17 @@ def descend(
         comparisons: M strict preferences.
         steps: Number of steps.
         batch_size: Preferences per member and step, drawn with replacement.
-        weight: How often each member draws each preference, ``[N, M]``, non-negative, each row
-            with a positive entry. Uniform if None. The comparisons' own weights count besides.
+        draws: How often each member draws each comparison; all alike if None.
         generator: Source of the draws.
 
     Returns:
         The last step's loss, averaged over members.
     """
-    count, device = len(loss.population), comparisons.preferred.device
-    if weight is not None:
-        weight = comparisons.weighted(weight)
-    elif comparisons.weight is not None:
-        weight = comparisons.weight.expand(count, -1)
+    count = len(loss.population)
+    draws = uniform(comparisons, count) if draws is None else draws
     value = torch.tensor(float("nan"))
     for _ in range(steps):
-        if weight is None:
-            shape = (count, batch_size)
-            index = torch.randint(len(comparisons), shape, generator=generator, device=device)
-        else:
-            index = torch.multinomial(weight, batch_size, replacement=True, generator=generator)
+        index = draws(batch_size, generator)
         batch = {"preferred": comparisons.preferred[index], "other": comparisons.other[index]}
         value = loss(TensorDict(batch, index.shape))["loss_cpl"]
         optimizer.zero_grad(set_to_none=True)

@@ -22,6 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from popl_rl.algorithms.draws import by_comparison
 from popl_rl.algorithms.expectation import Expectation, expect
 from popl_rl.algorithms.losses import CPLLoss, cpl_loss, descend
 from popl_rl.algorithms.problem import Problem
@@ -123,8 +124,7 @@ class MixturePOPL:
                 self.train.comparisons,
                 steps=min(settings.block, settings.steps - done),
                 batch_size=self.problem.training.batch_size,
-                # Nobody speaks for nothing: an empty place needs something to draw.
-                weight=self._responsibility() + 1e-6,
+                draws=by_comparison(self.train.comparisons, self._responsibility()),
                 generator=self.generator,
             )
         self.generation += 1

@@ -5,11 +5,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from popl_rl.algorithms.draws import Draws, by_case
 from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.variation import GradientCPL
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.population import Population
-from popl_rl.models.scoring import case_values, rater_accuracy
+from popl_rl.models.scoring import pass_shares, rater_accuracy
 
 __all__ = ["MultiCPL"]
 
@@ -56,22 +57,23 @@ class MultiCPL:
             accuracy) and ``mean_accuracy``, both as the generation found them, and ``loss_cpl``.
         """
         scores, comparisons = self.problem.scores(self.population), self.problem.comparisons
-        passes = scores[:, comparisons.preferred] > scores[:, comparisons.other]
-        weight, about = self._weights(scores)
+        passed = pass_shares(scores, comparisons)
+        draws, about = self._draws(scores)
         # Everybody is the one child of itself.
-        itself = torch.arange(len(self.population), device=weight.device)
-        trained = self.training(itself, weight)
+        itself = torch.arange(len(self.population), device=scores.device)
+        trained = self.training.descend(itself, draws)
         self.generation += 1
         return {
-            "worst_rater_accuracy": rater_accuracy(case_values(passes, comparisons)),
-            "mean_accuracy": float(passes.float().mean()),
+            "worst_rater_accuracy": rater_accuracy(passed.values),
+            "mean_accuracy": passed.mean,
             **about,
             **trained,
         }
 
-    def _weights(self, scores: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """How often each member draws each comparison, ``[N, M]``, and scalars to log."""
-        return scores.new_ones(len(scores), len(self.problem.comparisons)), {}
+    def _draws(self, scores: Tensor) -> tuple[Draws, dict[str, float]]:
+        """How often each member draws each comparison, and scalars to log."""
+        comparisons = self.problem.comparisons
+        return by_case(comparisons, scores.new_ones(len(scores), comparisons.num_cases)), {}
 
     def result(self) -> HypothesisSet:
         """One member for each distinct behaviour, its scale fitted for catering."""

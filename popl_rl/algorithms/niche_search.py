@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from popl_rl.algorithms.assembly import find_rule
+from popl_rl.algorithms.draws import by_case
 from popl_rl.algorithms.expectation import expect
 from popl_rl.algorithms.losses import descend
 from popl_rl.algorithms.needed import nested_subsets, predicted
@@ -258,7 +259,6 @@ def descend_served(
         comparisons,
         steps=problem.block,
         batch_size=problem.training.batch_size,
-        # A member that serves nobody still needs something: everything, a bit.
-        weight=served[:, comparisons.case] + 1e-9,
+        draws=by_case(comparisons, served, least=1e-9),
         generator=generator,
     )

@@ -24,7 +24,7 @@ from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.population import Population
 from popl_rl.models.preference_likelihood import log_likelihood, per_case
 from popl_rl.models.schedules import decay
-from popl_rl.models.scoring import case_values, rater_accuracy
+from popl_rl.models.scoring import rater_accuracy
 
 __all__ = ["NichePOPL"]
 
@@ -100,8 +100,7 @@ class NichePOPL:
         """
         if self.generation == self.settled:
             self._settle()
-        comparisons = self.problem.comparisons
-        passes = self.problem.margins(self.population) > 0
+        passed = self.problem.pass_shares(self.population)
         if self.found is None:
             members = sum(len(search.stack) for search in self.searches)
             loss = self._search()
@@ -111,8 +110,8 @@ class NichePOPL:
         share = self.searches[0].share_of_largest() if self.found is None else self.found.share
         self.generation += 1
         return {
-            "worst_rater_accuracy": rater_accuracy(case_values(passes, comparisons)),
-            "mean_accuracy": float(passes.float().mean()),
+            "worst_rater_accuracy": rater_accuracy(passed.values),
+            "mean_accuracy": passed.mean,
             "members": float(members),
             "effective_members": float(1 / share.square().sum()),
             "loss_cpl": loss,

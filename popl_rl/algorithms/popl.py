@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from popl_rl.algorithms.problem import Problem
+from popl_rl.algorithms.rater_similarity import RaterSimilarity
 from popl_rl.algorithms.refinement import refine
 from popl_rl.algorithms.variation import Variation
 from popl_rl.config import RefinementSettings
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.population import Population
-from popl_rl.models.scoring import case_values, rater_accuracy
-from popl_rl.selection.downsampling import spread_out
+from popl_rl.models.scoring import rater_accuracy
 from popl_rl.selection.lexicase import SelectionReport, lexicase_given_first, lexicase_report
 from popl_rl.selection.mad import mad
 from popl_rl.selection.rules import Selection, report
@@ -38,8 +38,7 @@ class POPL:
         population: N members, changed in place.
         variation: How children differ from their parents.
         epsilon: Tolerance of lexicase selection; ``"mad"``, a number, or None for none.
-        similarity: How alike the raters want, ``[C, C]`` in [-1, 1] (see
-            ``popl_rl.algorithms.rater_similarity``). If given, a child is selected for one rater,
+        similarity: How alike the C raters want. If given, a child is selected for one rater,
             whose case comes first in its order, and learns from raters like that one. Half of these
             raters are random, the others unlike each other, so that small groups are not
             overlooked.
@@ -62,7 +61,7 @@ class POPL:
         population: Population,
         variation: Variation,
         epsilon: float | Literal["mad"] | None = "mad",
-        similarity: Tensor | None = None,
+        similarity: RaterSimilarity | None = None,
         select: Selection | None = None,
         refinement: RefinementSettings | None = None,
         generator: torch.Generator,
@@ -87,21 +86,19 @@ class POPL:
             member's accuracy), ``mean_accuracy``, ``selection_depth`` (cases used per selection),
             ``distinct`` and ``effective_parents``, and what the variation reports.
         """
-        comparisons = self.problem.comparisons
-        passes = self.problem.margins(self.population) > 0
-        values = case_values(passes, comparisons)
+        values, mean = self.problem.pass_shares(self.population)
         tolerance = mad(values) if self.epsilon == "mad" else self.epsilon
         strong = values >= values.amax(0) - (0.0 if tolerance is None else tolerance)
         first = None if self.similarity is None else self._first_raters(self.similarity)
         selected = self._select(values, first, tolerance)
         strength = strong.float()[selected.parents]
         if self.similarity is not None and first is not None:
-            strength = (strength + _FLOOR) * self.similarity[first].clamp(min=0)
-        varied = self.variation(selected.parents, strength[:, comparisons.case])
+            strength = (strength + _FLOOR) * self.similarity.rows(first).clamp(min=0)
+        varied = self.variation(selected.parents, strength)
         self.generation += 1
         return {
             "worst_rater_accuracy": rater_accuracy(values),
-            "mean_accuracy": float(passes.float().mean()),
+            "mean_accuracy": mean,
             "selection_depth": float(selected.depth.float().mean()),
             "distinct": float(selected.distinct),
             "effective_parents": selected.effective,
@@ -118,13 +115,13 @@ class POPL:
             return lexicase_report(values, count, epsilon=tolerance, generator=generator)
         return lexicase_given_first(values, first, epsilon=tolerance, generator=generator)
 
-    def _first_raters(self, similarity: Tensor) -> Tensor:
+    def _first_raters(self, similarity: RaterSimilarity) -> Tensor:
         """For whom the children are: half at random, half unlike each other, ``[N]``."""
         spread = len(self.population) // 2
         shape = (len(self.population) - spread,)
         device = self.generator.device
         first = torch.randint(len(similarity), shape, generator=self.generator, device=device)
-        return torch.cat([first, spread_out(similarity, spread, generator=self.generator)])
+        return torch.cat([first, similarity.spread_out(spread, generator=self.generator)])
 
     def result(self) -> HypothesisSet:
         """The refined members, or one member for each behaviour, scaled for catering."""

@@ -15,7 +15,7 @@ from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.policies import Spec
 from popl_rl.models.population import Population
 from popl_rl.models.preference_likelihood import log_likelihood
-from popl_rl.models.scoring import margins, segment_scores
+from popl_rl.models.scoring import PassShares, margins, margins_of, pass_shares, segment_scores
 from popl_rl.models.sets import as_set
 from popl_rl.models.style_codes import StyleClone
 from popl_rl.models.style_population import StyledPopulation
@@ -99,8 +99,11 @@ class Problem:
 
     def margins(self, population: Population) -> Tensor:
         """Margins ``S(sigma+) - S(sigma-)`` of every member on every comparison, ``[N, M]``."""
-        scores = self.scores(population)
-        return scores[:, self.comparisons.preferred] - scores[:, self.comparisons.other]
+        return margins_of(self.scores(population), self.comparisons)
+
+    def pass_shares(self, population: Population) -> PassShares:
+        """Which share of each case's comparisons each member passes."""
+        return pass_shares(self.scores(population), self.comparisons)
 
     def likelihood(self, scores: Tensor) -> Tensor:
         """Log-likelihood of every answer, the one that every method here maximises.

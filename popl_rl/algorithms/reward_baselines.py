@@ -81,8 +81,11 @@ def brex_set(
     network = build_network(spec, generator=generator).to(bank.row.device)
     features = segment_features(network[:-1], bank, spec.action_dim)
     burn_in = steps // 10
+    pairs = comparisons.preferred, comparisons.other
+    many = len(comparisons) > len(bank)
     chain = brex(
-        features[comparisons.preferred] - features[comparisons.other],
+        features if many else features[pairs[0]] - features[pairs[1]],
+        pairs=pairs if many else None,
         steps=steps,
         burn_in=burn_in,
         keep=min(keep, steps - burn_in),

@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 
 from popl_rl.algorithms.cpl import pooled_population
+from popl_rl.algorithms.draws import by_case
 from popl_rl.algorithms.losses import CPLLoss, descend
 from popl_rl.algorithms.problem import Problem
 from popl_rl.config import POPLSettings
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.population import Population
-from popl_rl.models.scoring import case_values
 
 __all__ = ["Specialists", "personalise", "specialists", "train_specialists"]
 
@@ -98,13 +98,15 @@ def personalise(
         batch_size: Answers per step.
         generator: Source of the batches.
     """
+    own = comparisons.rows(torch.isin(comparisons.case, raters).nonzero()[:, 0])
+    everybody = torch.arange(comparisons.num_cases, device=raters.device)
     descend(
         loss,
         torch.optim.Adam(loss.population.members.parameters(), lr=learning_rate),
-        comparisons,
+        own,
         steps=steps,
         batch_size=batch_size,
-        weight=(comparisons.case == raters.unsqueeze(1)).float(),
+        draws=by_case(own, (everybody == raters.unsqueeze(1)).float(), least=0.0),
         generator=generator,
     )
 
@@ -138,7 +140,7 @@ def train_specialists(
         learning_rate=problem.training.learning_rate / 2,
         generator=generator,
     )
-    values = case_values(problem.margins(found) > 0, comparisons)
+    values = problem.pass_shares(found).values
     place = torch.arange(len(rater), device=rater.device)
     own = values[place, rater]
     others = (values.sum(1) - own) / max(1, values.shape[1] - 1)

@@ -6,6 +6,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from popl_rl.algorithms.draws import Draws, by_case
 from popl_rl.algorithms.losses import CPLLoss, descend
 from popl_rl.algorithms.problem import Problem
 from popl_rl.data.comparisons import Comparisons
@@ -30,7 +31,7 @@ class Variation(Protocol):
 
         Args:
             parents: Member that each child copies, ``[N]``.
-            strength: How much each child should learn from each comparison, ``[N, M]``.
+            strength: How much each child should learn from each case, ``[N, C]``.
 
         Returns:
             Scalars to log.
@@ -164,17 +165,27 @@ class GradientCPL:
 
     def __call__(self, parents: Tensor, strength: Tensor) -> dict[str, float]:
         """See ``Variation``."""
+        return self.descend(parents, by_case(self.comparisons, strength))
+
+    def descend(self, parents: Tensor, draws: Draws) -> dict[str, float]:
+        """Replace the population by copies of ``parents`` that learn from what they draw.
+
+        Args:
+            parents: Member that each child copies, ``[N]``.
+            draws: How often each child draws each comparison.
+
+        Returns:
+            Scalars to log.
+        """
         self.loss.population.replace_(parents)
         inherit_moments(self.optimizer, parents)
-        # A child of one that is strong nowhere still needs something: everything, a bit.
-        weight = strength + 1e-6
         value = descend(
             self.loss,
             self.optimizer,
             self.comparisons,
             steps=self.steps,
             batch_size=self.batch_size,
-            weight=weight,
+            draws=draws,
             generator=self.generator,
         )
         self.schedule.step()

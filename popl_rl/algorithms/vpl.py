@@ -13,8 +13,10 @@ from dataclasses import replace
 from typing import Any, cast
 
 import torch
+import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 from torch import Tensor
 
+from popl_rl.algorithms.draws import by_case
 from popl_rl.algorithms.losses import cpl_loss
 from popl_rl.algorithms.problem import Problem
 from popl_rl.config import VPLSettings
@@ -23,7 +25,7 @@ from popl_rl.models.policies import PolicySpec, build_network
 from popl_rl.models.population import Population
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.models.schedules import linear_decay
-from popl_rl.models.scoring import case_values, rater_accuracy
+from popl_rl.models.scoring import rater_accuracy
 from popl_rl.selection.farthest_first import farthest_first
 
 __all__ = ["VPL", "divergence", "spread_points"]
@@ -118,7 +120,7 @@ class VPL:
             accuracy) and ``mean_accuracy``, both as the generation found them, ``loss_cpl`` and
             ``divergence``.
         """
-        passes = self.problem.margins(self.population) > 0
+        passed = self.problem.pass_shares(self.population)
         loss, apart = torch.zeros(2)
         for _ in range(self.problem.block):
             loss, apart = self._losses()
@@ -129,8 +131,8 @@ class VPL:
         self.schedule.step()
         self.generation += 1
         return {
-            "worst_rater_accuracy": rater_accuracy(case_values(passes, self.problem.comparisons)),
-            "mean_accuracy": float(passes.float().mean()),
+            "worst_rater_accuracy": rater_accuracy(passed.values),
+            "mean_accuracy": passed.mean,
             "loss_cpl": float(loss.detach()),
             "divergence": float(apart.detach()),
         }
@@ -141,8 +143,9 @@ class VPL:
         rater = torch.randint(
             said.num_cases, (self.raters,), generator=source, device=self.problem.device
         )
-        mine = said.weighted((said.case == rater.unsqueeze(1)).float())
-        index = torch.multinomial(mine, self.answers, replacement=True, generator=source)
+        index = by_case(said, F.one_hot(rater, said.num_cases).float(), least=0.0)(
+            self.answers, source
+        )
         preferred, other = said.preferred[index], said.other[index]
         mean, log_std = self.encoder(self.problem.bank, preferred, other)
         noise = torch.randn(mean.shape, generator=source, device=mean.device)

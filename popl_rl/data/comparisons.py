@@ -1,7 +1,9 @@
 """Preferences in the form a learner reads: no group, no utility, no rater model."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from functools import cached_property
+from typing import Literal, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -9,7 +11,24 @@ from torch import Tensor
 
 from popl_rl.keys import ANSWER, CHANCE, PAIR, RATER, Answer
 
-__all__ = ["Comparisons"]
+__all__ = ["Comparisons", "Grouped"]
+
+
+class Grouped(NamedTuple):
+    """Comparisons in the order of their cases.
+
+    Attributes:
+        order: The comparisons, ``[M]``.
+        total: Sums of their weights in this order, each up to and with its own, ``[M]`` float64.
+        last: Place in this order of each case's last comparison, ``[C]``; of a case without any
+            that of the case before.
+        stop: Sums of the weights up to the end of each case, ``[C]`` float64.
+    """
+
+    order: Tensor
+    total: Tensor
+    last: Tensor
+    stop: Tensor
 
 
 @dataclass(frozen=True)
@@ -54,6 +73,21 @@ class Comparisons:
     def sizes(self) -> Tensor:
         """Comparisons of each case, by their weights, ``[C]``."""
         return self.case.bincount(self.weight, minlength=self.num_cases)
+
+    @cached_property
+    def grouped(self) -> Grouped:
+        """The comparisons in the order of their cases; worked out once."""
+        order = self.case.argsort(stable=True)
+        weight = torch.ones_like(self.case) if self.weight is None else self.weight[order]
+        total = weight.cumsum(0, dtype=torch.float64)
+        last = self.case.bincount(minlength=self.num_cases).cumsum(0) - 1
+        stop = torch.where(last < 0, 0.0, total[last.clamp(min=0)])
+        return Grouped(order, total, last, stop)
+
+    def blocks(self, size: int) -> Iterator[slice]:
+        """Slices of at most ``size`` comparisons, all of them one after the other."""
+        for start in range(0, len(self), size):
+            yield slice(start, min(start + size, len(self)))
 
     @classmethod
     def from_preferences(

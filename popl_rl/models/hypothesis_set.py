@@ -273,8 +273,10 @@ class HypothesisSet:
     ) -> int:
         """As ``fair``, from comparisons; the most accurate one where nobody's are known by id."""
         values = case_values(self.margins(segments, comparisons).cpu() > 0, comparisons)
-        by_case = values.mean(1) if comparisons.is_single else values.quantile(quantile, dim=1)
-        return int(by_case.argmax())
+        if comparisons.is_single:
+            return int(values.mean(1).argmax())
+        # One after the other: torch refuses the quantiles of more than 16 million values at once.
+        return int(torch.stack([row.quantile(quantile) for row in values]).argmax())
 
     def save(self, path: Path | str, *, provenance: Mapping[str, str] | None = None) -> None:
         """Write the set as tensors and JSON; nothing is left half-written.

@@ -1,6 +1,7 @@
 """Scores of segments, margins of comparisons and values of cases in the eyes of a population."""
 
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
@@ -12,12 +13,25 @@ from popl_rl.models.layers import apply_layers, change_layers, some_layers
 from popl_rl.models.population import Population
 from popl_rl.models.reward_functions import RewardSpec
 
-__all__ = ["case_values", "margins", "rater_accuracy", "segment_scores"]
+__all__ = [
+    "PassShares",
+    "case_means",
+    "case_sums",
+    "case_values",
+    "margins",
+    "margins_of",
+    "pass_shares",
+    "rater_accuracy",
+    "segment_scores",
+]
 
 
 # A CPU core multiplies fastest what stays in its cache from one layer to the next.
 _ROWS = 1024  # observations looked at together
 
+
+# Margins that are held at once.
+_MARGINS = 2**22
 
 _BLOCK = 2**18  # outputs of a layer, over these observations and some members
 
@@ -222,7 +236,13 @@ def margins(
         ``[N, M]`` float32; a positive margin is a pass.
     """
     scores = segment_scores(population, bank, alpha=alpha, discount=discount)
-    return scores[:, comparisons.preferred] - scores[:, comparisons.other]
+    return margins_of(scores, comparisons)
+
+
+def margins_of(scores: Tensor, comparisons: Comparisons, part: slice = slice(None)) -> Tensor:
+    """Margins of comparisons, or of a part of them, by scores of segments ``[N, segments]``."""
+    preferred, other = comparisons.preferred[part], comparisons.other[part]
+    return scores.index_select(1, preferred) - scores.index_select(1, other)
 
 
 def case_values(passes: Tensor, comparisons: Comparisons) -> Tensor:
@@ -239,6 +259,69 @@ def case_values(passes: Tensor, comparisons: Comparisons) -> Tensor:
     total = torch.zeros(len(passes), comparisons.num_cases, device=passes.device)
     total.index_add_(1, comparisons.case, comparisons.weighted(passes.float()))
     return total / comparisons.sizes().clamp(min=1e-6)
+
+
+def case_sums(
+    scores: Tensor, comparisons: Comparisons, value: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """Sums over each case's comparisons of what follows from their margins, by their weights.
+
+    Blocks of comparisons are worked out one after the other, so that memory does not grow with
+    their number.
+
+    Args:
+        scores: Scores of the segments, ``[N, segments]``.
+        comparisons: M comparisons and the case of each.
+        value: Maps margins ``[N, B]`` of some comparisons to values of the same shape.
+
+    Returns:
+        ``[N, C]`` float32.
+    """
+    total = torch.zeros(len(scores), comparisons.num_cases, device=scores.device)
+    for part in comparisons.blocks(max(1, _MARGINS // len(scores))):
+        some = value(margins_of(scores, comparisons, part)).float()
+        if comparisons.weight is not None:
+            some = some * comparisons.weight[part]
+        total.index_add_(1, comparisons.case[part], some)
+    return total
+
+
+def case_means(
+    scores: Tensor, comparisons: Comparisons, value: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """Means in the place of ``case_sums``; 0 for a case without comparisons."""
+    return case_sums(scores, comparisons, value) / comparisons.sizes().clamp(min=1e-6)
+
+
+class PassShares(NamedTuple):
+    """What a population passes.
+
+    Attributes:
+        values: Share of each case's comparisons that each member passes, ``[N, C]``.
+        mean: Share of all comparisons that members pass on average.
+    """
+
+    values: Tensor
+    mean: float
+
+
+def pass_shares(scores: Tensor, comparisons: Comparisons) -> PassShares:
+    """Which share of each case's comparisons each member passes, as of ``case_values``.
+
+    Args:
+        scores: Scores of the segments, ``[N, segments]``.
+        comparisons: M comparisons and the case of each.
+    """
+    count = 0
+
+    def passes(margin: Tensor) -> Tensor:
+        nonlocal count
+        passed = margin > 0
+        count += int(passed.count_nonzero())
+        return passed
+
+    values = case_means(scores, comparisons, passes)
+    return PassShares(values, count / (len(scores) * len(comparisons)))
 
 
 def rater_accuracy(values: Tensor, quantile: float = 0.1) -> float:

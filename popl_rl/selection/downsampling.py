@@ -11,6 +11,8 @@ To let each selection see a sample of its own instead, use ``cases_per_selection
 `popl_rl.selection.lexicase.lexicase_selection`; that saves no scoring.
 """
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -94,25 +96,32 @@ def informed_downsample(
     )
 
 
-def spread_out(similarity: Tensor, count: int, *, generator: torch.Generator) -> Tensor:
+def spread_out(
+    similarity: Callable[[Tensor], Tensor],
+    num_raters: int,
+    count: int,
+    *,
+    generator: torch.Generator,
+) -> Tensor:
     """Choose raters unlike each other: farthest first, from a random one.
 
     As informed down-sampling does with cases (Boldi et al., 2024), it keeps what is rare in sight.
 
     Args:
-        similarity: Correlations ``[rater, rater]``.
+        similarity: Correlations of some raters with all, ``[R] -> [R, rater]``.
+        num_raters: Number of raters.
         count: Raters to choose, at least 1; more than there are repeat.
         generator: Source of the first one.
 
     Returns:
         Indices of raters in the order in which they were chosen, ``[count]``, int64.
     """
-    start = int(torch.randint(len(similarity), (), generator=generator, device=generator.device))
+    start = int(torch.randint(num_raters, (), generator=generator, device=generator.device))
     return farthest_first(
-        lambda some, others: similarity[others][:, some].T,
-        len(similarity),
+        lambda some, others: similarity(others)[:, some].T,
+        num_raters,
         count,
         first=start,
         repeat=True,
-        device=similarity.device,
+        device=generator.device,
     )

@@ -233,3 +233,29 @@ def test_a_likelihood_that_overflows_is_reported(generator):
     huge = 1e300 * CONTRAST.double()
     with pytest.raises(ValueError, match=r"log-likelihood must be finite, got -inf at step \d+; "):
         brex(huge, confidence=1e10, generator=generator)
+
+
+def test_pairs_of_segments_are_their_contrasts(generator, monkeypatch):
+    """The same chain, from features of segments and who was preferred to whom."""
+    monkeypatch.setattr("popl_rl.algorithms.brex._PAIRS", 50)
+    features = torch.randn(20, 4, generator=generator)
+    preferred, other = torch.randint(20, (2, 120), generator=generator)
+    chains = [
+        brex(
+            features[preferred] - features[other],
+            steps=400,
+            keep=40,
+            generator=torch.Generator().manual_seed(3),
+        ),
+        brex(
+            features,
+            pairs=(preferred, other),
+            steps=400,
+            keep=40,
+            generator=torch.Generator().manual_seed(3),
+        ),
+    ]
+    assert 0 < chains[0].acceptance < 1
+    assert chains[0].acceptance == chains[1].acceptance
+    torch.testing.assert_close(chains[0].weights, chains[1].weights)
+    torch.testing.assert_close(chains[0].log_likelihood, chains[1].log_likelihood)

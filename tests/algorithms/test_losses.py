@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import nn
 
+from popl_rl.algorithms.draws import by_comparison
 from popl_rl.algorithms.losses import CPLLoss, cpl_loss, descend
 from popl_rl.data.bank import SegmentBank
 from popl_rl.models.policies import PolicySpec
@@ -255,7 +256,7 @@ def test_each_member_draws_what_its_weights_say(population, bank, comparisons, g
         comparisons,
         steps=2,
         batch_size=200,
-        weight=weight,
+        draws=by_comparison(comparisons, weight),
         generator=generator,
     )
     assert len(seen) == 2

@@ -1,10 +1,10 @@
 import pytest
 import torch
+import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 
 from popl_rl.algorithms.losses import CPLLoss
 from popl_rl.algorithms.rater_similarity import rater_similarity, seed_with_specialists
 from popl_rl.algorithms.specialists import specialists
-from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.population import Population
 from popl_rl.models.scoring import case_values, margins
@@ -20,9 +20,10 @@ def loss(population, bank):
     return CPLLoss(population, bank)
 
 
-def one_comparison_each(count):
-    rows = torch.arange(count)
-    return Comparisons(rows, rows + count, rows, count)
+def correlations(margin, raters):
+    """Of everybody with everybody, told by margins of specialists on one comparison each."""
+    similarity = rater_similarity(F.logsigmoid(margin), raters)
+    return similarity.rows(torch.arange(len(similarity)))
 
 
 def test_kinship_by_hand():
@@ -32,7 +33,7 @@ def test_kinship_by_hand():
     replaces a rater's own specialist, opposite between the pairs.
     """
     sign = torch.tensor([1.0, 1.0, -1.0, -1.0])
-    similarity = rater_similarity(50 * sign.outer(sign), one_comparison_each(4), torch.arange(4))
+    similarity = correlations(50 * sign.outer(sign), torch.arange(4))
     assert similarity.shape == (4, 4)
     torch.testing.assert_close(similarity.diagonal(), torch.ones(4))
     assert similarity[0, 1] > 0.3
@@ -45,18 +46,17 @@ def test_a_specialist_says_nothing_about_its_own_rater():
     margin = torch.randn(5, 5, generator=torch.Generator().manual_seed(0))
     changed = margin.clone()
     changed.diagonal().fill_(100.0)
-    comparisons = one_comparison_each(5)
     everybody = torch.arange(5)
     torch.testing.assert_close(
-        rater_similarity(margin, comparisons, everybody),
-        rater_similarity(changed, comparisons, everybody),
+        correlations(margin, everybody),
+        correlations(changed, everybody),
     )
 
 
 def test_specialists_for_some_tell_of_all():
     sign = torch.tensor([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
     some = torch.tensor([4, 0, 1])
-    similarity = rater_similarity(50 * sign[some].outer(sign), one_comparison_each(6), some)
+    similarity = correlations(50 * sign[some].outer(sign), some)
     assert similarity.shape == (6, 6)
     assert similarity[2, 1] > 0.4  # nobody is a specialist for rater 2
     assert similarity[3, 5] > 0.4
@@ -66,7 +66,7 @@ def test_specialists_for_some_tell_of_all():
 def test_a_rater_whom_all_explain_alike_is_nobodys_kin():
     margin = torch.randn(4, 4, generator=torch.Generator().manual_seed(0))
     margin[:, 2] = 1.0
-    similarity = rater_similarity(margin, one_comparison_each(4), torch.arange(4))
+    similarity = correlations(margin, torch.arange(4))
     assert similarity.isfinite().all()
     assert similarity[2].abs().max() < 1e-3
 
@@ -91,7 +91,8 @@ def test_specialists_pass_what_their_raters_said(population, loss, bank, compari
 def test_groups_are_told_apart(population, loss, comparisons, generator):
     """The first four raters want the opposite of the other four."""
     single = population.subset([0])
-    similarity = seed_with_specialists(population, single, loss, comparisons, generator=generator)
+    found = seed_with_specialists(population, single, loss, comparisons, generator=generator)
+    similarity = found.rows(torch.arange(8))
     same = torch.arange(8).unsqueeze(1) // 4 == torch.arange(8) // 4
     alike = similarity[same & ~torch.eye(8, dtype=torch.bool)]
     assert alike.mean() > 0.3

@@ -139,10 +139,3 @@ def test_vpl_needs_ids_policies_and_whole_networks(learner, learning):
         built(learner, learning, evolve="head", **vpl)
     with pytest.raises(ValueError, match="method vpl needs a hidden layer"):
         built(learner, (RewardSpec(5, 2, ()), bank, comparisons), **vpl)
-
-
-def test_too_many_raters_are_not_compared_with_each_other(learner, learning, monkeypatch):
-    spec, bank, comparisons = learning
-    assert learner(spec, bank, comparisons, members=4).similarity is not None
-    monkeypatch.setattr("popl_rl.algorithms.assembly._MOST_SIMILAR", 3)
-    assert learner(spec, bank, comparisons, members=4).similarity is None

@@ -198,11 +198,15 @@ def test_those_unlike_each_other_are_chosen(generator):
     similarity = torch.ones(10, 10)
     similarity[9, :9] = similarity[:9, 9] = -1.0
     for _ in range(5):
-        chosen = spread_out(similarity, 2, generator=generator)
+        chosen = spread_out(lambda some: similarity[some], 10, 2, generator=generator)
         assert len(chosen) == 2
         assert (chosen == 9).sum() == 1
 
 
 def test_more_than_there_are_repeat(generator):
-    assert len(spread_out(torch.eye(3), 7, generator=generator)) == 7
-    assert set(spread_out(torch.eye(3), 3, generator=generator).tolist()) == {0, 1, 2}
+    assert len(spread_out(lambda some: torch.eye(3)[some], 3, 7, generator=generator)) == 7
+    assert set(spread_out(lambda some: torch.eye(3)[some], 3, 3, generator=generator).tolist()) == {
+        0,
+        1,
+        2,
+    }
