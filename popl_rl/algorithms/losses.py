@@ -89,6 +89,7 @@ class CPLLoss(LossModule):
         self.discount = discount
         self.slip = slip
         self._features: Tensor | None = None
+        self._cells = bank.row
 
     @property
     def in_keys(self) -> list[str]:
@@ -96,39 +97,46 @@ class CPLLoss(LossModule):
         return ["preferred", "other"]
 
     def scores(self, segment: Tensor) -> Tensor:
-        """Differentiable scores of each member's own segments.
+        """Differentiable scores of each member's own segments, or of segments that all share.
 
         Args:
-            segment: Segment numbers ``[N, B]``.
+            segment: Segment numbers ``[N, B]``, or ``[B]``, the same for every member.
 
         Returns:
             ``[N, B]``.
         """
-        bank, population = self.bank, self.population
-        row = bank.row[segment].flatten(1)
-        action = bank.action[segment].flatten(1, 2)
-        if bank.is_shared and len(bank.observation) <= row.shape[1]:
-            # Fewer distinct observations than steps in the batch: look at each once. What the
-            # frozen trunk makes of them never changes.
-            if self._features is None:
-                self._features = population.trunk(bank.observation)
-            output = population.from_features(self._features)
-            if population.spec.discrete:
-                # Normalise the few distinct rows, not every step of the batch.
-                table = population.spec.table(output).flatten(1)
-                cell = row * output.shape[-1] + action
-                value = table.gather(1, cell)
-            else:
-                output = output.gather(1, row.unsqueeze(-1).expand(-1, -1, output.shape[-1]))
-                value = population.spec.step_scores(output, action)
+        bank = self.bank
+        if bank.is_shared and len(bank.observation) <= segment.shape[-1] * bank.row.shape[1]:
+            value = self._looked_up(segment)
         else:
-            value = population.spec.step_scores(population(bank.observation[row]), action)
-        value = value.view(*segment.shape, -1)
+            row, action = bank.row[segment], bank.action[segment]
+            output = self.population(bank.observation[row].flatten(-3, -2))
+            action = action.flatten(segment.ndim - 1, segment.ndim)
+            value = self.population.spec.step_scores(output, action)
+        value = value.view(len(self.population), segment.shape[-1], -1)
         weight = self.alpha * bank.weights(segment, discount=self.discount)
         if weight.ndim > 1:
             return (value * weight).sum(-1)
         scores: Tensor = value @ weight
         return scores
+
+    def _looked_up(self, segment: Tensor) -> Tensor:
+        """Scores of steps ``[N, B * T]``: each distinct observation is looked at once."""
+        bank, population, spec = self.bank, self.population, self.population.spec
+        if self._features is None:
+            # What the frozen trunk makes of observations never changes.
+            self._features = population.trunk(bank.observation)
+            self._cells = bank.row * spec.action_dim + bank.action if spec.discrete else bank.row
+        output = population.from_features(self._features)
+        count, choices = len(population), output.shape[-1]
+        # A choice of rows that lie together: several times as fast as ``self._cells[segment]``.
+        cell = self._cells.index_select(0, segment.flatten())
+        cell = cell.view(*segment.shape[:-1], -1).expand(count, -1)
+        if spec.discrete:
+            # Normalise the few distinct rows, not every step of the batch.
+            return spec.table(output).flatten(1).gather(1, cell)
+        output = output.gather(1, cell.unsqueeze(-1).expand(-1, -1, choices))
+        return spec.step_scores(output, bank.action[segment].flatten(-3, -2))
 
     def _loss(self, preferred: Tensor, other: Tensor) -> Tensor:
         return cpl_loss(preferred, other, conservatism=self.conservatism, slip=self.slip)
@@ -143,8 +151,7 @@ class CPLLoss(LossModule):
         Returns:
             ``[N, B]``.
         """
-        segment = torch.cat([preferred, other]).expand(len(self.population), -1)
-        return self._loss(*self.scores(segment).chunk(2, dim=1))
+        return self._loss(*self.scores(torch.cat([preferred, other])).chunk(2, dim=1))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of one batch per member.
