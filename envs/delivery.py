@@ -214,7 +214,7 @@ class DeliveryGrid(gymnasium.Env[Any, Any]):
         )
         first: Tensor = torch.zeros(self.cells)
         first[torch.from_numpy(self.starts)] = 1 / len(self.starts)
-        return Table(steps, next_state, ends | closed, first)
+        return Table(steps, next_state, ends | closed, first, horizon=self.max_steps)
 
 
 def _read(path: Path) -> dict[str, NDArray[Any]]:

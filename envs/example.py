@@ -82,7 +82,9 @@ class Exits(gymnasium.Env):
         is_end = torch.isin(torch.arange(SIZE * SIZE), torch.tensor(ENDS))
         start = (~is_end).float()
         terminal = torch.isin(after, torch.tensor(ENDS))
-        return Table(TensorDict(steps, after.shape), after, terminal, start / start.sum())
+        listed = TensorDict(steps, after.shape)
+        # The horizon is the steps after which an episode is truncated: never, here.
+        return Table(listed, after, terminal, start / start.sum(), horizon=np.inf)
 
     def behaviours(self):
         """Optional: what the data show, in the shares of env.mixture; random actions without.

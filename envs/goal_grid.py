@@ -123,7 +123,8 @@ class GoalGrid(gymnasium.Env[Any, Any]):
             batch_size=shape,
         )
         terminal = torch.zeros(shape, dtype=torch.bool)
-        return Table(steps, next_state, terminal, torch.full((states,), 1 / states))
+        start = torch.full((states,), 1 / states)
+        return Table(steps, next_state, terminal, start, horizon=self.max_steps)
 
     def behaviours(self) -> dict[str, Tensor | Explorer]:
         """Return what data can show: an explorer and random actions, no one's own wish."""

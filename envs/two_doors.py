@@ -200,7 +200,7 @@ class TwoDoors(MiniGridEnv):
         )
         first = torch.tensor([self._index[state] for state in self._first])
         start = first.bincount(minlength=num_states) / len(first)
-        return Table(steps, next_state, goal, start)
+        return Table(steps, next_state, goal, start, horizon=self.max_steps)
 
     def behaviours(self) -> dict[str, Tensor | Explorer]:
         """Return what data can show: planners, an explorer and random actions.

@@ -27,6 +27,7 @@ from torchrl.envs import EnvBase
 from popl_rl.data.behaviours import Behaviour
 
 __all__ = [
+    "Native",
     "adapt_behaviour",
     "adapted",
     "as_gymnasium",
@@ -38,7 +39,7 @@ _MOST = 1024  # combinations of a MultiDiscrete or MultiBinary action at most
 _numbers = itertools.count()
 
 
-class _Native(gymnasium.Wrapper[Any, Any, Any, Any]):
+class Native(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Remembers the spaces of the environment below, before they are adapted."""
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
@@ -86,7 +87,7 @@ def adapted(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
         TypeError: If its observations cannot be flattened, or its actions are of another kind.
         ValueError: If there are more combinations of actions than a policy can choose from.
     """
-    return _with_flat_actions(_with_flat_observations(_Native(env)))
+    return _with_flat_actions(_with_flat_observations(Native(env)))
 
 
 def native_spaces(env: gymnasium.Env[Any, Any]) -> tuple[spaces.Space[Any], spaces.Space[Any]]:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from popl_rl.keys import ACTION, INFO, OBSERVATION, REWARD
 
-__all__ = ["MASK", "lockstep", "numeric_info"]
+__all__ = ["MASK", "clear_after_end", "lockstep", "numeric_info", "stack_resets"]
 
 #: Key of the ``[B, H]`` bool mask of the steps that were really taken.
 MASK = "mask"
@@ -60,11 +60,10 @@ def lockstep(
     if len(envs) != len(seeds):
         raise ValueError(f"seeds must be one per environment ({len(envs)}), got {len(seeds)}")
     starts = [env.reset(seed=int(seed)) for env, seed in zip(envs, seeds, strict=True)]
-    observation = np.stack([np.asarray(start[0], dtype=np.float32) for start in starts])
+    observation, info = stack_resets(starts)
     infos = [start[1] for start in starts]
     names = _Names(infos)
     steps = [env.step for env in envs]
-    info = _stack_info(infos, names)
     alive = np.ones(len(envs), dtype=bool)
     frames: list[tuple[Tensor, Tensor, np.ndarray, np.ndarray, dict[str, Tensor]]] = []
     for _ in range(max_steps):
@@ -85,20 +84,35 @@ def lockstep(
         if not alive.any():
             break
     observations, actions, rewards, masks, about = zip(*frames, strict=True)
-    episodes = TensorDict(
-        {
-            OBSERVATION: torch.stack(observations, 1),
-            ACTION: torch.stack(actions, 1),
-            REWARD: torch.from_numpy(np.stack(rewards, 1)),
-            INFO: {name: _over_time(about, name) for name in names.known},
-            MASK: torch.from_numpy(np.stack(masks, 1)),
-        },
-        [len(envs), len(frames)],
+    return clear_after_end(
+        TensorDict(
+            {
+                OBSERVATION: torch.stack(observations, 1),
+                ACTION: torch.stack(actions, 1),
+                REWARD: torch.from_numpy(np.stack(rewards, 1)),
+                INFO: {name: _over_time(about, name) for name in names.known},
+                MASK: torch.from_numpy(np.stack(masks, 1)),
+            },
+            [len(envs), len(frames)],
+        )
     )
+
+
+def stack_resets(
+    starts: Sequence[tuple[Any, dict[str, Any]]],
+) -> tuple[np.ndarray, dict[str, Tensor]]:
+    """First observations ``[B, ...]`` and the numbers in first infos, ``[B]`` each."""
+    observation = np.stack([np.asarray(start[0], dtype=np.float32) for start in starts])
+    infos = [start[1] for start in starts]
+    return observation, _stack_info(infos, _Names(infos))
+
+
+def clear_after_end(episodes: TensorDict) -> TensorDict:
+    """Episodes ``[B, H]`` with zeros wherever ``mask`` says that there was no step, in place."""
     gone = ~episodes[MASK]
     if gone.any():
         for value in episodes.values(True, True):
-            value[gone] = 0
+            value.masked_fill_(gone.view(*gone.shape, *[1] * (value.ndim - 2)), 0)
     return episodes
 
 

@@ -14,7 +14,8 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorStorage
 
 from popl_rl.data.behaviours import Behaviour
-from popl_rl.data.rollouts import MASK, lockstep
+from popl_rl.data.rollouts import MASK
+from popl_rl.data.table_rollouts import Rollouts
 from popl_rl.keys import INFO
 from popl_rl.locks import locked
 from popl_rl.manifest import digest_of_tensors
@@ -91,10 +92,9 @@ def collect_segments(
     }
     _check_counts(counts)
     given = _checked_shares(behaviours, shares)
-    envs = [make_env() for _ in range(num_envs)]
     collected: list[TensorDict] = []
     total, reached = 0, 0.0
-    try:
+    with Rollouts(make_env) as roll:
         for name, behaviour in behaviours.items():
             reached += given.get(name, 0.0)
             quota = round(reached * num_segments)
@@ -104,7 +104,7 @@ def collect_segments(
                 if hasattr(behaviour, "reset"):
                     behaviour.reset()
                 act = partial(_act, behaviour, generator)
-                episodes = lockstep(envs, act, seeds=seeds, max_steps=max_steps)
+                episodes = roll(act, seeds=seeds, max_steps=max_steps)
                 segments = cut_segments(episodes, length)
                 barren = 0 if len(segments) else barren + 1
                 if barren == 5:
@@ -119,9 +119,6 @@ def collect_segments(
                 total += len(order)
                 if progress is not None:
                     progress(total)
-    finally:
-        for env in envs:
-            env.close()
     everything: TensorDict = torch.cat(_alike(collected))  # type: ignore[call-overload]
     return everything[torch.randperm(total, generator=generator)]
 

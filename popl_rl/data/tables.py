@@ -30,10 +30,14 @@ class Table:
             acts in it.
         terminal: ``[S, A]`` bool, whether the step ends the episode.
         start: ``[S]`` probabilities of the first state, summing to one.
+        horizon: Steps after which the environment itself cuts an episode, ``math.inf`` if never.
+            With it the table says all that stepping does, its ``info`` included, so that episodes
+            are looked up instead (see ``popl_rl.data.table_rollouts``). None if that depends on
+            anything else: then environments are stepped.
 
     Raises:
         ValueError: If a shape does not match ``steps``, a key is missing, an index is out of range,
-            or ``start`` is no distribution.
+            ``start`` is no distribution, or ``horizon`` is below 1.
         TypeError: If ``next_state`` is not int64 or ``terminal`` not bool.
     """
 
@@ -41,6 +45,7 @@ class Table:
     next_state: Tensor
     terminal: Tensor
     start: Tensor
+    horizon: float | None = None
 
     def __post_init__(self) -> None:
         if len(self.steps.batch_size) != 2:
@@ -80,6 +85,8 @@ class Table:
         own = torch.arange(states, device=self.next_state.device).unsqueeze(1)
         if not bool((self.steps[state_key] == own).all()):
             raise ValueError('steps["info", "state"] must be the index of its own row everywhere.')
+        if self.horizon is not None and not self.horizon >= 1:
+            raise ValueError(f"horizon must be at least 1, got {self.horizon}.")
         if bool((self.start < 0).any()) or abs(float(self.start.double().sum()) - 1) > 1e-5:
             raise ValueError(
                 f"start must be probabilities that sum to 1, got sum {float(self.start.sum()):g} "

@@ -9,7 +9,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from popl_rl.data.behaviours import first_action
-from popl_rl.data.rollouts import MASK, lockstep
+from popl_rl.data.rollouts import MASK
+from popl_rl.data.table_rollouts import Rollouts
 from popl_rl.keys import ANSWER, INFO, OBSERVATION, PAIR, Answer
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet
@@ -84,16 +85,13 @@ def roll_out(
         assert random_action is not None
         return random_action(step, generator)
 
-    envs = [make_env() for _ in range(count * episodes)]
-    first = first_action(envs[0].action_space)
+    roll = Rollouts(make_env)
+    first = first_action(roll.env.action_space)
     # Sets that were saved before their actions were the environment's count them from 0.
     spec = policies.population.spec if isinstance(policies, PolicySet) else None
     moved = first - spec.first_action if isinstance(spec, PolicySpec) else 0
-    try:
-        flat = lockstep(envs, act, seeds=starts * count, max_steps=max_steps)
-    finally:
-        for env in envs:
-            env.close()
+    with roll:
+        flat = roll(act, seeds=starts * count, max_steps=max_steps)
     return flat.unflatten(0, (count, episodes))
 
 

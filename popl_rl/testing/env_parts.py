@@ -41,6 +41,7 @@ class Step(NamedTuple):
     observation: NDArray[np.float32]
     reward: float
     terminated: bool
+    truncated: bool
     info: dict[str, float]
 
 
@@ -72,7 +73,8 @@ def random_steps(name: str, env: Env, num_steps: int, seed: int) -> list[Step]:
                     f"env {name!r}: reset must return (observation, info), got "
                     f"{_described(answer)}."
                 )
-            action, (observation, info), reward, terminated, over = None, answer, 0.0, False, False
+            action, (observation, info), reward = None, answer, 0.0
+            terminated = truncated = over = False
         else:
             action = env.action_space.sample()
             answer = call("env", name, "step", env.step, action)
@@ -88,7 +90,8 @@ def random_steps(name: str, env: Env, num_steps: int, seed: int) -> list[Step]:
         if not outside and not env.observation_space.contains(seen):
             outside = f"values from {seen.min():g} to {seen.max():g}"
         numbers = _checked_info(name, info)
-        steps.append(Step(action, seen, float(reward), bool(terminated), numbers))
+        ends = bool(terminated), bool(truncated)
+        steps.append(Step(action, seen, float(reward), *ends, numbers))
     if outside:
         warnings.warn(
             f"env {name!r}: observations should lie in {env.observation_space}, got {outside}; "
@@ -191,10 +194,10 @@ def check_table(name: str, table: Any, env: Env, steps: list[Step]) -> None:
             f"env {name!r}: with a transition table, info must hold 'state' and 'next_state', and "
             f"the table all of info's keys; info has {sorted(given)}, the table {sorted(listed)}."
         )
-    current = -1
+    current, taken = -1, 0
     for step in steps:
         if step.action is None:
-            current = int(step.info["state"])
+            current, taken = int(step.info["state"]), 0
             if not 0 <= current < len(table.start) or table.start[current] <= 0:
                 _disagree(name, f"start gives no probability to the first state {current}")
             continue
@@ -211,6 +214,11 @@ def check_table(name: str, table: Any, env: Env, steps: list[Step]) -> None:
             _disagree(name, f"next_state is {after} {where}, stepped to {step.info['next_state']}")
         if step.terminated != bool(table.terminal[current, column]):
             _disagree(name, f"terminal is {not step.terminated} {where}, it was {step.terminated}")
+        taken += 1
+        if table.horizon is not None and step.truncated != (taken >= table.horizon):
+            _disagree(
+                name, f"horizon is {table.horizon}, truncated was {step.truncated} at {taken}"
+            )
         if not np.isclose(step.reward, float(row[REWARD]), atol=1e-5):
             _disagree(name, f"reward is {float(row[REWARD]):g} {where}, got {step.reward:g}")
         if not np.allclose(step.observation, table.steps[OBSERVATION][after, 0], atol=1e-5):

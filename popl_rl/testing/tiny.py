@@ -54,7 +54,8 @@ class _Walk(gymnasium.Env[Any, Any]):
             batch_size=state.shape,
         )
         start = torch.full((self._CELLS,), 1 / self._CELLS)
-        return Table(steps, next_state, torch.zeros(state.shape, dtype=torch.bool), start)
+        terminal = torch.zeros(state.shape, dtype=torch.bool)
+        return Table(steps, next_state, terminal, start, horizon=self._max_steps)
 
     def _after(self, cell: int, action: int) -> int:
         return min(max(cell + (1 if action else -1), 0), self._CELLS - 1)

@@ -21,8 +21,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from popl_rl.data.rollouts import MASK, lockstep
+from popl_rl.data.table_rollouts import Rollouts
+from popl_rl.envs.goal_grid import goal_grid
 from popl_rl.envs.two_doors import two_doors
-from popl_rl.keys import OBSERVATION
+from popl_rl.evaluation.optimum import action_probabilities
+from popl_rl.keys import INFO, OBSERVATION
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.population import Population
@@ -134,4 +137,52 @@ def test_lockstep(
     )
     for env in envs:
         env.close()
+    assert ratio > least
+
+
+@pytest.mark.parametrize(
+    ("make", "acts", "least"),
+    [
+        (two_doors, "tables", 15),
+        (two_doors, "networks", 7),  # which take most of the time
+        (goal_grid, "tables", 6),  # its own steps take a quarter of the time of Minigrid's
+    ],
+)
+def test_table(race: Any, make: Any, acts: str, least: float) -> None:
+    """As many episodes as an evaluation rolls, looked up in the table of transitions."""
+    count, episodes, max_steps = 16, 200, 60
+    env = make()
+    draws = torch.Generator().manual_seed(0)
+    spec = PolicySpec.from_env(env, hidden=(64, 64))
+    policies = PolicySet(Population.create(spec, count, generator=draws))
+    tables = action_probabilities(policies, env.transition_table())
+    member = torch.arange(count).repeat_interleave(episodes)
+    seeds = torch.randint(2**31, (episodes,), generator=draws).tolist() * count
+
+    def roll() -> TensorDictBase:
+        generator = torch.Generator().manual_seed(1)
+
+        def act(step: TensorDictBase) -> Tensor:
+            if acts == "tables":
+                rows = tables[member, step[INFO, "next_state"]]
+                return torch.multinomial(rows, 1, generator=generator).squeeze(-1)
+            observation = step[OBSERVATION].view(count, episodes, -1)
+            return policies.act(observation, generator=generator).flatten(0, 1)
+
+        with Rollouts(make) as rollouts:
+            assert rollouts.table is not None
+            return rollouts(act, seeds=seeds, max_steps=max_steps)
+
+    rolled = roll()
+    steps = int(rolled[MASK].sum())
+    actions = [row["action"][row[MASK]].numpy() for row in rolled.unbind(0)]
+    ratio = race(
+        f"{count} policies ({acts}) x {episodes} episodes of {make.__name__}, looked up, "
+        f"{steps} steps",
+        roll,
+        lambda: bare([env] * len(seeds), seeds, actions),
+        reference="bare env.step",
+        target=20,
+        rounds=5,
+    )
     assert ratio > least
