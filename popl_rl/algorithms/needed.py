@@ -8,9 +8,17 @@ from torch import Tensor
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.preference_likelihood import leave_one_out, per_case
 
-__all__ = ["Nested", "nested_subsets", "predicted", "sufficient"]
+__all__ = ["Nested", "nested_subsets", "predicted", "sizes_up_to", "sufficient"]
 
 _NEGLIGIBLE = 0.002  # nats of an answer that are not worth a member
+
+
+def sizes_up_to(most: int) -> list[int]:
+    """Numbers of members to be compared: 1, 2, 3, 5, 8, 12, ..., each half as many again."""
+    sizes = [1]
+    while (further := max(sizes[-1] + 1, -(-3 * sizes[-1] // 2))) <= most:
+        sizes.append(further)
+    return sizes
 
 
 class Nested(NamedTuple):

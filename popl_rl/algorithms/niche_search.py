@@ -20,7 +20,7 @@ from popl_rl.algorithms.assembly import find_rule
 from popl_rl.algorithms.draws import by_case
 from popl_rl.algorithms.expectation import expect
 from popl_rl.algorithms.losses import descend
-from popl_rl.algorithms.needed import nested_subsets, predicted
+from popl_rl.algorithms.needed import nested_subsets, predicted, sizes_up_to
 from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.specialists import personalise, train_specialists
 from popl_rl.algorithms.stacked_adam import StackedAdam
@@ -31,7 +31,7 @@ from popl_rl.models.scoring import case_values
 from popl_rl.selection.lexicase import lexicase_given_first
 from popl_rl.selection.mad import mad
 
-__all__ = ["NicheSearch", "sizes_up_to"]
+__all__ = ["NicheSearch"]
 
 #: Selections for each founder: several fall on the same specialist.
 _DRAWS = 8
@@ -40,14 +40,6 @@ _CHILD_RATE = 0.5  # of the recipe's learning rate, at which a child learns from
 
 #: Answers per step of a child's moment with its rater.
 _CHILD_BATCH = 32
-
-
-def sizes_up_to(most: int) -> list[int]:
-    """Numbers of members to be compared: 1, 2, 3, 5, 8, 12, ..., each half as many again."""
-    sizes = [1]
-    while (further := max(sizes[-1] + 1, -(-3 * sizes[-1] // 2))) <= most:
-        sizes.append(further)
-    return sizes
 
 
 class NicheSearch:

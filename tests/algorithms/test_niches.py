@@ -5,32 +5,16 @@ from dataclasses import replace
 import pytest
 import torch
 
-from popl_rl.algorithms.niche_search import NicheSearch, sizes_up_to
+from popl_rl.algorithms.needed import sizes_up_to
+from popl_rl.algorithms.niche_search import NicheSearch
 from popl_rl.algorithms.niches import NichePOPL
 from popl_rl.algorithms.problem import Problem
 from popl_rl.config import NicheSettings, POPLSettings, Training
 from popl_rl.data.bank import SegmentBank
-from popl_rl.data.comparisons import Comparisons
-from popl_rl.envs.hidden_utility import sample_states
-from popl_rl.models.reward_functions import RewardSpec, reward_bank
-from popl_rl.models.scoring import case_values
+from popl_rl.models.reward_functions import RewardSpec
 
 SPEC = RewardSpec(1, 1, (32, 32))
 POPL = POPLSettings(specialist_steps=10, pooled_steps=20)
-
-
-def ring(groups, *, raters=12, answers=12, seed=0):
-    """Raters of groups evenly on a ring: bank, comparisons and the group of each rater."""
-    generator = torch.Generator().manual_seed(seed)
-    states = sample_states(400, generator=generator)
-    group = torch.arange(raters * groups) % groups
-    rater = torch.arange(len(group)).repeat_interleave(answers)
-    pair = torch.randint(400, (len(rater), 2), generator=generator)
-    value = states["observation"][:, 0, 0][pair] + (group[rater] / groups).unsqueeze(1)
-    first = (value.remainder(1)[:, 0] > value.remainder(1)[:, 1]).long()
-    row = torch.arange(len(rater))
-    comparisons = Comparisons(pair[row, 1 - first], pair[row, first], rater, len(group))
-    return reward_bank(states), comparisons, group
 
 
 def build(bank: SegmentBank, comparisons, *, seed=0, members=8, steps=400, **more):
@@ -46,14 +30,8 @@ def run(method):
     return method.result(), metrics
 
 
-def served(found, bank, comparisons, group):
-    """How right the best member is on the raters of each group."""
-    values = case_values(found.margins(bank, comparisons) > 0, comparisons)
-    return [float(values[:, group == one].mean(1).max()) for one in group.unique()]
-
-
 @pytest.mark.parametrize("groups", [1, 2, 3])
-def test_it_finds_as_many_as_there_are(groups):
+def test_it_finds_as_many_as_there_are(ring, served, groups):
     bank, comparisons, group = ring(groups, raters=30)
     method = build(bank, comparisons)
     found, metrics = run(method)
@@ -65,7 +43,7 @@ def test_it_finds_as_many_as_there_are(groups):
     assert [size for size, _, _ in method.sizes] == [1, 2, 3, 5, 8]
 
 
-def test_each_rater_is_held_out_of_one_search():
+def test_each_rater_is_held_out_of_one_search(ring):
     """Answers of the held out turned round: the search never learns of them and stays the same."""
     bank, comparisons, _ = ring(2, raters=6)
     out = torch.arange(comparisons.num_cases) % 3 == 0
@@ -95,7 +73,7 @@ def test_each_rater_is_held_out_of_one_search():
     assert times.tolist() == [1] * 12
 
 
-def test_children_take_the_places_of_members_that_nobody_needs():
+def test_children_take_the_places_of_members_that_nobody_needs(ring):
     bank, comparisons, _ = ring(2)
     search = build(bank, comparisons, members=12).searches[0]
     before = search.stack.members.data.clone()
@@ -109,7 +87,7 @@ def test_children_take_the_places_of_members_that_nobody_needs():
     assert 1 <= sum(same) <= 9  # three quarters stay at most, children have learnt
 
 
-def test_the_population_is_never_larger_than_it_began():
+def test_the_population_is_never_larger_than_it_began(ring):
     """Tables of each member over generations have the columns of the first one."""
     bank, comparisons, _ = ring(2, raters=6)
     method = build(bank, comparisons, steps=60)
@@ -126,7 +104,7 @@ def test_sizes_grow_by_half():
     assert sizes_up_to(1) == [1]
 
 
-def test_populations_of_several_sizes_train_side_by_side():
+def test_populations_of_several_sizes_train_side_by_side(ring):
     bank, comparisons, _ = ring(2)
     search = build(bank, comparisons, members=8).searches[0]
     search.divide()
@@ -141,27 +119,27 @@ def test_populations_of_several_sizes_train_side_by_side():
     assert (values[:, search.raters] == 0).all()
 
 
-def test_too_few_members_are_said():
+def test_too_few_members_are_said(ring):
     bank, comparisons, _ = ring(4, raters=15)
     method = build(bank, comparisons, members=2)
     with pytest.warns(UserWarning, match="raise method.members"):
         run(method)
 
 
-def test_another_rule_may_select():
+def test_another_rule_may_select(ring, served):
     bank, comparisons, group = ring(2, raters=30)
     found, _ = run(build(bank, comparisons, selection="random"))
     assert min(served(found, bank, comparisons, group)) > 0.8
 
 
-def test_a_single_rater_has_no_groups():
+def test_a_single_rater_has_no_groups(ring):
     bank, comparisons, _ = ring(1, raters=1)
     with pytest.raises(ValueError, match="at least 2 raters"):
         build(bank, comparisons)
 
 
 @pytest.mark.parametrize("at", [2, 9, 15])
-def test_it_goes_on_to_the_bit(at):
+def test_it_goes_on_to_the_bit(ring, at):
     bank, comparisons, _ = ring(2, raters=6)
     through, before = build(bank, comparisons, steps=60), build(bank, comparisons, steps=60)
     for _ in range(at):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from popl_rl.algorithms.niche_search import sizes_up_to
+from popl_rl.algorithms.needed import sizes_up_to
 from popl_rl.evaluation.statistics import RESULT_COLUMNS, read_results
 from popl_rl.models.encoded_policy_set import EncodedPolicySet
 from popl_rl.models.policies import PolicySpec
