@@ -8,12 +8,13 @@ Nothing here imports raters: a learner cannot see who voted.
 ``variation``: how children differ from their parents; ``rater_similarity``: who wants alike.
 ``popl``: POPL; ``assembly``: POPL from its settings; ``refinement``: its last training;
 ``mixture_population``: POPL without rater ids.
-``niches``: POPL for any number of groups; ``niche_search``: one of its searches;
-``specialists``: a member for a rater; ``needed``: which members, and how many, raters need;
-``stacked_adam``: an optimiser for a population that grows and shrinks.
-``multi_cpl``: CPL ensembles; ``cpl``: pooled CPL and the oracle; ``em``: EM mixtures; ``kmeans``:
-clusters of raters first; ``vpl``: a latent variable; ``lore``: low-rank reward functions;
-``brex``, ``dpl``, ``reward_baselines``: reward learners that know no groups.
+``niches``: POPL for any number of groups; ``niche_search``: one of its searches; ``divisions``:
+how it divides raters; ``specialists``: a member for a rater; ``needed``: which members, and how
+many, raters need; ``stacked_adam``: an optimiser for a population that grows and shrinks.
+``multi_cpl``: CPL ensembles; ``cpl``: pooled CPL and the oracle; ``em``: EM mixtures;
+``chosen_em``: EM that is not told how many; ``kmeans``: clusters of raters first; ``vpl``: a latent
+variable; ``lore``: low-rank reward functions; ``brex``, ``dpl``, ``reward_baselines``: reward
+learners that know no groups.
 ``trainer``: any method as a TorchRL Trainer with checkpoints; ``plugged``: methods and selection
 rules of other people, checked wherever they are called.
 """

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from popl_rl.algorithms.assembly import find_rule
+from popl_rl.algorithms.divisions import Division, divisions
 from popl_rl.algorithms.draws import by_case
 from popl_rl.algorithms.expectation import expect
 from popl_rl.algorithms.losses import descend
@@ -137,19 +138,11 @@ class NicheSearch:
         alive = (served >= 1) | (served == served.max())
         return [part.start + int(member) for member in alive.nonzero()[:, 0]]
 
-    def values(self) -> Tensor:
-        """How well the population of each size predicts raters it has not learnt of, ``[S, C]``.
-
-        Mean log-likelihood of a rater's answers, see ``popl_rl.algorithms.needed.predicted``; 0 for
-        all other raters.
-        """
-        likelihood = self._likelihood(self.judged)
-        members = [self.members_of(index) for index in range(len(self.sizes))]
-        return torch.stack([predicted(likelihood[one], self.judged.comparisons) for one in members])
-
-    def population(self, index: int) -> Population:
-        """The population of one size, without members that serve nobody."""
-        return self.stack.subset(self.members_of(index))
+    def divisions(self) -> list[Division]:
+        """The best division of the raters for each size, by raters it has not learnt of."""
+        alive = [self.members_of(index) for index in range(len(self.sizes))]
+        populations = [(self.stack.subset(one), self.share[one]) for one in alive]
+        return divisions(self.problem, self.judged, populations)
 
     def largest(self) -> Population:
         """The population of the largest size, as ``problem.members`` members.

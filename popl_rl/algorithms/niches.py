@@ -14,15 +14,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from popl_rl.algorithms.expectation import expect
-from popl_rl.algorithms.needed import predicted, sufficient
+from popl_rl.algorithms.divisions import Division, prediction, responsibility
+from popl_rl.algorithms.needed import sufficient
 from popl_rl.algorithms.niche_search import NicheSearch, descend_served
 from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.stacked_adam import StackedAdam
 from popl_rl.config import NicheSettings, POPLSettings
+from popl_rl.models.calibration import fit_response
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.population import Population
-from popl_rl.models.preference_likelihood import log_likelihood, per_case
+from popl_rl.models.preference_likelihood import MISTAKE
 from popl_rl.models.schedules import decay
 from popl_rl.models.scoring import rater_accuracy
 
@@ -46,6 +47,8 @@ class NichePOPL:
         generations: Generations after which it is finished: of the searches, and the problem's.
         sizes: What was compared, ``(members, mean log-likelihood of held-out raters' answers,
             standard error of how far that is behind the best, paired over raters)``; empty before.
+        scale: How much the members' scores are to be believed when they are catered, by raters whom
+            a search had not learnt of; 1 before.
 
     Raises:
         ValueError: If there is a single rater.
@@ -74,6 +77,7 @@ class NichePOPL:
         times = range(1, niches.selections + 1)
         self.selections = {self.divided * time // (niches.selections + 1) for time in times}
         self.sizes: list[tuple[int, float, float]] = []
+        self.scale = 1.0
         count = min(niches.searches, raters)
         order = torch.randperm(raters, generator=generator, device=problem.device)
         self.held_out = order % count
@@ -123,7 +127,7 @@ class NichePOPL:
         return self.searches[0].largest() if self.found is None else self.found.stack
 
     def result(self) -> HypothesisSet:
-        """The members that serve somebody, their scale fitted for catering."""
+        """The members that serve somebody, with scores of the scale that held-out raters gave."""
         population = self.population
         if self.found is not None:
             raters = self.found.share * self.problem.comparisons.num_cases
@@ -131,7 +135,8 @@ class NichePOPL:
             population = population.subset(alive.nonzero()[:, 0].tolist())
         found = self.problem.hypothesis_set(population)
         found.origin = []  # the population has been cut down to them
-        return self.problem.calibrated(found)
+        found.alpha *= self.scale
+        return found
 
     def _search(self) -> float:
         losses = []
@@ -148,7 +153,7 @@ class NichePOPL:
         problem = self.problem
         now, last = self.generation - self.settled, self.generations - self.settled
         if now >= _GIVEN * last:
-            found.served = self._served(found.stack, found.share)
+            found.served = responsibility(problem, found.stack, found.share)
             found.share = found.served.mean(1)
         found.training.optimizer.param_groups[0]["lr"] = problem.training.learning_rate * decay(
             now, last
@@ -161,8 +166,9 @@ class NichePOPL:
             if not search.sizes:
                 search.divide()
         sizes = min((search.sizes for search in self.searches), key=len)
+        divided = [search.divisions()[: len(sizes)] for search in self.searches]
         # Every rater is held out of one search, and its value is 0 in all the others.
-        value = torch.stack([search.values()[: len(sizes)] for search in self.searches]).sum(0)
+        value = torch.stack([torch.stack([one.value for one in found]) for found in divided]).sum(0)
         behind = value[value.mean(1).argmax()] - value
         error = behind.std(1, correction=0) / behind.shape[1] ** 0.5
         chosen = sufficient(behind, evidence=self.settings.evidence)
@@ -173,22 +179,19 @@ class NichePOPL:
                 "there may be more groups than members; raise method.members",
                 stacklevel=2,
             )
-        best = max((search.population(chosen) for search in self.searches), key=self._predicts)
-        share = value.new_full((len(best),), 1 / len(best))
-        served = self._served(best, share)
+        search, best = max(
+            zip(self.searches, (found[chosen] for found in divided), strict=True),
+            key=lambda pair: self._predicts(pair[1]),
+        )
+        judged = search.judged
+        self.scale = fit_response(best.margins(judged), judged.comparisons, mistake=MISTAKE)[0]
+        served = best.served(self.problem)
         self.found = _Niches(self.problem, served, generator=self.generator)
 
-    def _served(self, population: Population, share: Tensor) -> Tensor:
-        """E-step: how much each member serves each rater, ``[K, C]``."""
-        problem = self.problem
-        likelihood = per_case(problem.likelihood(problem.scores(population)), problem.comparisons)
-        return expect(likelihood, share).responsibility
-
-    def _predicts(self, population: Population) -> float:
-        """How well a population predicts all raters, most of whom it has learnt of."""
-        margin = self.problem.margins(population)
-        likelihood = log_likelihood(margin, self.problem.training.slip)
-        return float(predicted(likelihood, self.problem.comparisons).mean())
+    def _predicts(self, division: Division) -> float:
+        """How well a division predicts all raters, most of whom it has learnt of."""
+        margin = division.margins(self.problem)
+        return float(prediction(margin, self.problem.comparisons).mean())
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the next generation depends on."""
@@ -197,6 +200,7 @@ class NichePOPL:
             "searches": [] if self.found else [one.state_dict() for one in self.searches],
             "found": None if self.found is None else self.found.state_dict(),
             "sizes": [list(row) for row in self.sizes],
+            "scale": self.scale,
             "generator": self.generator.get_state(),
         }
 
@@ -204,6 +208,7 @@ class NichePOPL:
         """Continue from ``state_dict``, bit for bit."""
         self.generation = int(state["generation"])
         self.sizes = [(int(row[0]), float(row[1]), float(row[2])) for row in state["sizes"]]
+        self.scale = float(state["scale"])
         if state["found"] is None:
             for search, own in zip(self.searches, state["searches"], strict=True):
                 search.load_state_dict(own)

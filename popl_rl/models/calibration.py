@@ -6,10 +6,15 @@ from torch import Tensor
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.preference_likelihood import MISTAKE, leave_one_out, log_likelihood
 
-__all__ = ["SCALES", "fit_scale"]
+__all__ = ["MISTAKES", "SCALES", "fit_response", "fit_scale"]
 
 #: Scales that are tried: powers of two from an eighth to 32.
 SCALES = tuple(2.0**power for power in range(-3, 6))
+
+#: Chances of a slip that are tried.
+MISTAKES = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
+
+_FINE = tuple(2.0 ** (power / 2) for power in range(-10, 5))  # for raters not learnt of
 
 
 def fit_scale(margin: Tensor, comparisons: Comparisons, *, mistake: float = MISTAKE) -> float:
@@ -40,3 +45,36 @@ def fit_scale(margin: Tensor, comparisons: Comparisons, *, mistake: float = MIST
         for scale in SCALES
     ]
     return SCALES[int(torch.stack(values).argmax())]
+
+
+def fit_response(
+    margin: Tensor, comparisons: Comparisons, *, mistake: float | None = None
+) -> tuple[float, float]:
+    """Scale of the margins, and chance of a slip, under which raters' answers are predicted best.
+
+    For raters whom the members have not learnt of, of whom they may be much too sure: so scales
+    down to a thirty-second are tried. As in ``fit_scale``, each answer is predicted by the member
+    that its rater's other answers speak for. First the scale is fitted, then the chance of a slip,
+    then the scale again.
+
+    Args:
+        margin: Margins of the N members on M comparisons, ``[N, M]``.
+        comparisons: The comparisons, a case for each rater.
+        mistake: Chance of a slip, in [0, 0.5); fitted if None.
+
+    Returns:
+        The factor for the margins, and the chance of a slip, the given one or one of ``MISTAKES``.
+
+    Raises:
+        ValueError: If ``mistake`` is outside [0, 0.5).
+    """
+
+    def value(scale: float, slip: float) -> float:
+        likelihood = log_likelihood(scale * margin, slip)
+        return float(leave_one_out(likelihood, comparisons).mean())
+
+    scale = max(_FINE, key=lambda one: value(one, MISTAKE if mistake is None else mistake))
+    if mistake is not None:
+        return scale, mistake
+    slip = max(MISTAKES, key=lambda one: value(scale, one))
+    return max(_FINE, key=lambda one: value(one, slip)), slip

@@ -114,9 +114,11 @@ def test_populations_of_several_sizes_train_side_by_side(ring):
     ends = torch.tensor(search.sizes).cumsum(0).tolist()
     for begin, end in zip([0, *ends], ends, strict=False):
         assert float(search.share[begin:end].sum()) == pytest.approx(1, abs=1e-5)
-    values = search.values()
-    assert values.shape == (len(search.sizes), comparisons.num_cases)
-    assert (values[:, search.raters] == 0).all()
+    found = search.divisions()
+    assert len(found) == len(search.sizes)
+    for division in found:
+        assert division.value.shape == (comparisons.num_cases,)
+        assert (division.value[search.raters] == 0).all()
 
 
 def test_too_few_members_are_said(ring):
@@ -151,6 +153,7 @@ def test_it_goes_on_to_the_bit(ring, at):
     for _ in range(through.generations):
         through.step()
     assert torch.equal(through.found.share, after.found.share)
+    assert through.scale == after.scale
     assert through.sizes == after.sizes
     for one, other in zip(
         through.population.members.data.values(True, True),

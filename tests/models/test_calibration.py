@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from popl_rl.data.comparisons import Comparisons
-from popl_rl.models.calibration import SCALES, fit_scale
+from popl_rl.models.calibration import SCALES, fit_response, fit_scale
 from popl_rl.models.preference_likelihood import log_likelihood
 
 
@@ -51,3 +51,18 @@ def test_with_nothing_to_choose_the_scale_stays():
 def test_a_chance_of_slips_that_says_nothing_is_refused():
     with pytest.raises(ValueError, match=r"mistake must be in \[0, 0.5\), got 0.5"):
         fit_scale(torch.randn(2, 6), answers(2, 3), mistake=0.5)
+
+
+def test_raters_who_err_are_believed_as_much_as_they_deserve():
+    """Right in four answers of five by margins of 50: a scale or slips make that a chance of 0.8."""
+    margin = torch.where(torch.arange(200) % 5 == 0, -50.0, 50.0).unsqueeze(0)
+    for given in (None, 0.05, 0.2):
+        scale, mistake = fit_response(margin, answers(20, 10), mistake=given)
+        assert given in (None, mistake)
+        chance = log_likelihood(torch.tensor(50 * scale), mistake).exp()
+        assert float(chance) == pytest.approx(0.8, abs=0.03)
+
+
+def test_a_given_chance_of_slips_must_be_one():
+    with pytest.raises(ValueError, match=r"mistake must be in \[0, 0.5\), got 0.6"):
+        fit_response(torch.randn(2, 6), answers(2, 3), mistake=0.6)

@@ -1,0 +1,91 @@
+"""Numbers of niches are judged by the best division that there is for each."""
+
+import math
+
+import pytest
+import torch
+
+from popl_rl.algorithms.divisions import divisions, merge, prediction
+from popl_rl.algorithms.problem import Problem
+from popl_rl.config import Training
+from popl_rl.data.comparisons import Comparisons
+from popl_rl.models.reward_functions import RewardSpec
+
+SPEC = RewardSpec(1, 1, (8,))
+
+
+def comparisons_of(case):
+    rows = torch.arange(len(case))
+    return Comparisons(rows, rows + 1, torch.tensor(case), max(case) + 1)
+
+
+def test_members_speak_together_with_the_one_whose_raters_they_serve():
+    few = torch.tensor([[1.0, 1, 0, 0], [0, 0, 1, 1]])
+    many = torch.tensor([[0, 0, 0.9, 0], [0.6, 0.5, 0, 0.2], [0.4, 0.5, 0.1, 0.4]])
+    # Overlaps: (0, 0.9), (1.1, 0.2), (0.9, 0.5).
+    assert merge(many, few).tolist() == [1, 0, 0]
+    assert merge(many, few.flip(0)).tolist() == [0, 1, 0]
+
+
+def test_niches_that_get_nobody_are_left_out():
+    few = torch.tensor([[0.0, 0], [1, 0], [0, 1]])
+    assert merge(torch.eye(2), few).tolist() == [0, 1]
+    assert merge(few, few).tolist() == [0, 1, 2]  # a population is not merged with itself
+
+
+def test_members_that_are_too_sure_are_believed_less():
+    """Right in three answers of four of each rater, by margins of 100: as good as a 75 % chance."""
+    margin = torch.tensor([[100.0, 100, 100, -100] * 50])
+    case = torch.arange(50).repeat_interleave(4).tolist()
+    value = prediction(margin, comparisons_of(case))
+    best = 0.75 * math.log(0.75) + 0.25 * math.log(0.25)
+    assert float(value.mean()) == pytest.approx(best, abs=0.01)
+
+
+def test_a_smaller_number_is_judged_by_larger_populations_too(ring):
+    """Two members know whom they serve, and little more; four have learnt what those want."""
+    bank, comparisons, group = ring(2, raters=10)
+    problem = Problem(SPEC, bank, comparisons, Training(slip=0.05, conservatism=1.0))
+    generator = torch.Generator().manual_seed(0)
+    population = problem.initial_population(4, generator=generator)
+    wants = group[comparisons.case]
+    learn(problem, population, wants, steps=25)
+    two = population.subset([0, 2])
+    learn(problem, population, wants, steps=150)
+    share = torch.full((4,), 0.25)
+    populations = [(population.subset([0]), torch.ones(1)), (two, share[:2] * 2)]
+    alone, merged, four = divisions(problem, problem, [*populations, (population, share)])
+    (_, before) = divisions(problem, problem, populations)
+    assert merged.niche.tolist() == [0, 0, 1, 1]
+    assert four.niche.tolist() == [0, 1, 2, 3]
+    assert float(merged.value.mean()) > float(before.value.mean()) + 0.02
+    assert float(alone.value.mean()) < float(merged.value.mean()) - 0.1
+    # Each niche serves the raters of one group.
+    served = merged.served(problem)
+    assert torch.allclose(served.sum(0), torch.ones(20))
+    assert served[0][group == 0].mean() > 0.9
+    assert served[1][group == 1].mean() > 0.9
+
+
+def test_an_ensemble_speaks_by_what_its_members_serve(ring):
+    bank, comparisons, _ = ring(2, raters=4)
+    problem = Problem(SPEC, bank, comparisons)
+    population = problem.initial_population(3, generator=torch.Generator().manual_seed(0))
+    own = problem.margins(population)
+    (whole,) = divisions(problem, problem, [(population, torch.tensor([0.5, 0.25, 0.25]))])
+    together = whole._replace(niche=torch.tensor([0, 0, 1]))
+    expected = torch.stack([(2 * own[0] + own[1]) / 3, own[2]])
+    assert torch.allclose(together.margins(problem), expected, atol=1e-6)
+
+
+def learn(problem, population, wants, *, steps):
+    """The first two members learn one group's answers, the others the other's."""
+    loss = problem.loss(population)
+    optimizer = torch.optim.Adam(population.members.parameters(), lr=0.05)
+    comparisons = problem.comparisons
+    weight = torch.stack([wants == 0, wants == 0, wants == 1, wants == 1]).float()
+    for _ in range(steps):
+        losses = loss.pairs(comparisons.preferred, comparisons.other)
+        optimizer.zero_grad()
+        (losses * weight).mean(1).sum().backward()
+        optimizer.step()
