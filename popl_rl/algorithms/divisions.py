@@ -92,7 +92,8 @@ def merge(many: Tensor, few: Tensor) -> Tensor:
     """
     if many is few:
         return torch.arange(len(many), device=many.device)
-    return (many @ few.T).argmax(1).unique(return_inverse=True)[1]
+    niche: Tensor = (many @ few.T).argmax(1).unique(return_inverse=True)[1]
+    return niche
 
 
 def responsibility(problem: Problem, population: Population, share: Tensor) -> Tensor:

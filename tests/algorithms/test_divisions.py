@@ -24,7 +24,7 @@ def test_members_speak_together_with_the_one_whose_raters_they_serve():
     many = torch.tensor([[0, 0, 0.9, 0], [0.6, 0.5, 0, 0.2], [0.4, 0.5, 0.1, 0.4]])
     # Overlaps: (0, 0.9), (1.1, 0.2), (0.9, 0.5).
     assert merge(many, few).tolist() == [1, 0, 0]
-    assert merge(many, few.flip(0)).tolist() == [0, 1, 0]
+    assert merge(many, few.flip(0)).tolist() == [0, 1, 1]
 
 
 def test_niches_that_get_nobody_are_left_out():
