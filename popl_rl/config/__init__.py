@@ -7,7 +7,7 @@ they check themselves; ``overrides``: what somebody typed that changes nothing, 
 """
 
 from popl_rl.config.checks import MOST, MOST_SEED, Checker, parse_epsilon
-from popl_rl.config.data import DataConfig, EnvConfig, RatersConfig, ResponseConfig
+from popl_rl.config.data import DataConfig, EnvConfig, PPOSettings, RatersConfig, ResponseConfig
 from popl_rl.config.evaluation import EvaluationConfig
 from popl_rl.config.method import (
     SECTIONS,
@@ -65,6 +65,7 @@ __all__ = [
     "MixtureSettings",
     "NicheSettings",
     "POPLSettings",
+    "PPOSettings",
     "PageSettings",
     "PeopleConfig",
     "RatersConfig",

@@ -8,7 +8,26 @@ from typing import Any
 
 from popl_rl.config.checks import MOST, Checker
 
-__all__ = ["DataConfig", "EnvConfig", "RatersConfig", "ResponseConfig"]
+__all__ = ["DataConfig", "EnvConfig", "PPOSettings", "RatersConfig", "ResponseConfig"]
+
+
+@dataclass
+class PPOSettings:
+    """How PPO learns what a group of raters wants in an environment, for reference."""
+
+    frames: int = 100_000  # steps in the environment for each group
+    discount: float = 0.99  # factor of the next step's utility relative to this one's
+    learning_rate: float = 3e-3  # of Adam at the start; falls linearly to 0
+    action_std: float = 0.5  # standard deviation of continuous actions while it learns
+    store: str = "runs/ppo"  # folder in which policies are kept for all runs
+
+    def check(self, at: Checker) -> None:
+        """Report values that are out of range."""
+        at.at_least_one(self, "frames")
+        at.share(self, "discount")
+        at.positive(self, "learning_rate", most=10)
+        at.positive(self, "action_std", most=1000)
+        at.expect(bool(self.store), "store", "a folder", self.store)
 
 
 @dataclass
@@ -25,10 +44,12 @@ class EnvConfig:
     success: str = "goal"  # number in info that is positive when the task is done
     door: str | None = None  # integer in info whose values are worth a row in the table
     measured: list[str] = field(default_factory=list)  # numbers in info whose mean and peak are
+    ppo: PPOSettings = field(default_factory=PPOSettings)
 
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
         at.at_least_one(self, "max_steps")
+        self.ppo.check(at.below("ppo"))
         reference = "a reference, such as env.factory=my_env.py:make"
         at.expect(bool(self.factory), "factory", reference, self.factory)
         if self.factory == "gymnasium:make":

@@ -27,6 +27,8 @@ class EvaluationConfig:
     # typical behaviour; others: the oracle of whichever other group suits a group least
     baselines: bool = True  # train pooled CPL and the oracle too
     baselines_from: str | None = None  # folder 'baselines' of a run on the same data; not trained
+    # Policies that PPO trains on each group's utility too (env.ppo), kept for all runs.
+    ppo_reference: bool = False
     reward_baselines: bool = True  # B-REX and DPL too, where items are judged
     brex_steps: int = 10_000  # steps of B-REX's chain
     dpl_steps: int = 500  # steps of DPL's training

@@ -169,7 +169,7 @@ class Optimising(Rolling):
             reward = reward_of(rewards, member)
             self._trained[key] = train_ppo(
                 lambda: counting_from_zero(self.world.make()),
-                lambda observation, action: reward(observation, action) - best,
+                lambda steps: reward(steps) - best,
                 spec,
                 frames=self.frames,
                 max_steps=self.max_steps,

@@ -47,11 +47,7 @@ from popl_rl.evaluation.measures import (
 )
 from popl_rl.evaluation.optimum import ExactReturns
 from popl_rl.evaluation.protocol import EvaluationProtocol, MeasuredInfos
-from popl_rl.evaluation.references import (
-    score_behaviours,
-    score_distributional,
-    score_optimum,
-)
+from popl_rl.evaluation.references import score_distributional, score_references
 from popl_rl.evaluation.results import Performance, Rows, Scoreboard, Served
 from popl_rl.evaluation.unexplained_raters import look_for_unexplained
 from popl_rl.keys import RATER
@@ -203,6 +199,7 @@ class Evaluator:
         baselines: HypothesisSet | None,
         *,
         reward_baselines: RewardBaselines | None = None,
+        ppo: PolicySet | None = None,
         label: str = "popl",
     ) -> Scoreboard:
         """Fill the scoreboard.
@@ -213,6 +210,7 @@ class Evaluator:
                 them, and with them ``recovery``, out.
             reward_baselines: Other learners of reward functions, for
                 ``popl_rl.evaluation.acting.Choosing`` alone.
+            ppo: A policy for each group, trained on its utility, to compare with.
             label: Name of the method that found ``hypotheses``.
         """
         random = self._perform(None)
@@ -241,8 +239,8 @@ class Evaluator:
             if cloned is not None:
                 rows.add(("clone", ""), index, cloned, torch.ones(1))
             rows.add(("random", ""), index, random, torch.ones(1))
-        score_behaviours(rows, self.acting)
-        score_optimum(rows, self._exact)
+        best = None if ppo is None else self._perform(ppo)
+        score_references(rows, self.acting, ppo=best, exact=self._exact)
         rows.add_worst()
         return Scoreboard(rows.table(), catered, episodes, label)
 

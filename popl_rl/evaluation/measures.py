@@ -30,6 +30,7 @@ __all__ = [
     "roll_out",
     "steps_to_success",
     "success_rate",
+    "with_last_step_repeated",
 ]
 
 
@@ -113,12 +114,12 @@ def episode_returns(episodes: TensorDictBase, groups: Sequence[RaterGroup]) -> T
     """Undiscounted utility of each episode to each group, as ``group_returns``, ``[P, E, G]``."""
     flat = episodes.flatten(0, 1)
     mask = flat[MASK]
-    shown = _with_last_step_repeated(flat)
+    shown = with_last_step_repeated(flat)
     returns = [torch.where(mask, group.step_utility(shown), 0).sum(1) for group in groups]
     return torch.stack(returns, -1).view(*episodes.shape[:2], -1)
 
 
-def _with_last_step_repeated(episodes: TensorDictBase) -> TensorDictBase:
+def with_last_step_repeated(episodes: TensorDictBase) -> TensorDictBase:
     """Episodes ``[B, H]`` whose last real step stands in the place of what follows its end too."""
     mask = episodes[MASK]
     if bool(mask.all()):

@@ -51,6 +51,7 @@ METHODS = {
     "individual": ReportedMethod("one model for each person", "", True),
     "oracle": ReportedMethod("oracle (told the groups)", "black", True),
     "optimum": ReportedMethod("optimum", "", True, is_shown=False),
+    "ppo": ReportedMethod("PPO on the group's utility", "", True),
     "best_behaviour": ReportedMethod("best behaviour in the data", "", True),
     "data": ReportedMethod("behaviours of the data", "", True),
     "behaviour": ReportedMethod("behaviour", "", True, is_shown=False),

@@ -20,7 +20,7 @@ from torchrl.objectives.value import GAE
 
 from popl_rl.evaluation.ppo_episodes import (
     Ending,
-    clip_actions,
+    RewardFunction,
     roll_episodes,
     running_returns,
 )
@@ -31,8 +31,6 @@ from popl_rl.models.reward_set import RewardSet
 
 __all__ = ["reward_of", "train_ppo"]
 
-#: Maps observations ``[B, O]`` and actions ``[B]`` or ``[B, A]`` to rewards ``[B]``.
-RewardFunction = Callable[[Tensor, Tensor], Tensor]
 _LOG_PROB = "log_prob"
 _ADVANTAGE = "advantage"
 
@@ -45,8 +43,7 @@ def reward_of(rewards: RewardSet, member: int) -> RewardFunction:
         member: Which.
 
     Returns:
-        Maps observations ``[B, O]`` and actions, ``[B]`` int64 or ``[B, A]`` float, to rewards
-        ``[B]``.
+        Maps steps ``[...]`` with ``observation`` and ``action``, counted from 0, to rewards.
 
     Raises:
         IndexError: If there is no such member.
@@ -56,12 +53,15 @@ def reward_of(rewards: RewardSet, member: int) -> RewardFunction:
     own = rewards.subset([member])
     device = own.population.device
 
-    def reward(observation: Tensor, action: Tensor) -> Tensor:
+    def reward(steps: TensorDictBase) -> Tensor:
+        flat = steps.flatten()
+        observation, action = flat[OBSERVATION], flat[ACTION]
         if action.is_floating_point():
             joined = torch.cat([observation, action], -1).to(device)
-            return own.reward(joined)[0].squeeze(-1).to(observation.device)
-        table = own.reward(observation.to(device))[0].to(observation.device)
-        return table.gather(-1, action.unsqueeze(-1)).squeeze(-1)
+            gain = own.reward(joined)[0]
+        else:
+            gain = own.reward(observation.to(device))[0].cpu().gather(-1, action.unsqueeze(-1))
+        return gain.cpu().view(steps.batch_size)
 
     return reward
 
@@ -75,6 +75,7 @@ def train_ppo(
     frames_per_batch: int = 2048,
     num_envs: int = 32,
     max_steps: int,
+    tells: bool = False,
     discount: float = 0.97,
     gae_lambda: float = 0.95,
     clip_epsilon: float = 0.2,
@@ -90,20 +91,23 @@ def train_ppo(
     Whole episodes are collected in lockstep. One that ends by ``max_steps``, or that the
     environment truncates, is valued as if it went on; one that the environment terminates is over.
 
-    A learnt reward has an arbitrary scale, so rewards are divided by the running standard deviation
+    A reward has an arbitrary scale, so rewards are divided by the running standard deviation
     of the discounted returns (arXiv 2005.12729, section 3). They are not shifted: a constant per
     step decides whether it pays to end an episode.
 
     Args:
-        make_env: Builds one environment. Its own reward is ignored.
-        reward: What is maximised: maps observations ``[B, O]`` and actions ``[B]`` (discrete) or
-            ``[B, A]`` to ``[B]``. It sees actions within the bounds of the action space.
+        make_env: Builds one environment.
+        reward: What is maximised: maps episodes ``[E, H]`` to the reward of each step, ``[E, H]``,
+            as the utility of a rater group does. It sees actions within the bounds of the action
+            space, and after an episode's end its last step again.
         spec: Architecture of the policy; it must be that of the environment. The critic has the
             same hidden layers.
         frames: Least number of steps in the environments; the last batch is completed.
         frames_per_batch: Least number of steps between two updates; episodes are completed.
         num_envs: Environments that advance together.
         max_steps: Steps after which an episode is cut.
+        tells: Whether ``reward`` reads the environment's own rewards and infos, which are 0 and
+            empty otherwise.
         discount: Factor of the next step's reward relative to this one's.
         gae_lambda: Decay of the generalised advantage estimate (arXiv 1506.02438): 0 trusts the
             critic, 1 what happened.
@@ -140,7 +144,6 @@ def train_ppo(
         sizes={"clip_epsilon": clip_epsilon, "learning_rate": learning_rate},
         entropy=entropy,
     )
-
     network = build_network(spec, generator=generator)
     learner = _Learner(
         spec,
@@ -151,19 +154,19 @@ def train_ppo(
         learning_rate=learning_rate,
         generator=generator,
     )
-    envs = [Ending(make_env()) for _ in range(num_envs)]
+    envs = [Ending(make_env(), tells=tells) for _ in range(num_envs)]
     try:
         _check_spec(spec, envs[0])
         act = partial(_act, spec, network, generator=generator)
         done = 0
         while done < frames:
-            batch = _roll_batch(envs, act, frames_per_batch, max_steps, generator)
-            gain = _rewards(reward, batch, envs[0].action_space)
+            batch = _roll_batch(envs, act, reward, frames_per_batch, max_steps, generator)
+            returned = float(batch["next", REWARD].sum() / batch["next", "done"].sum())
             learner.anneal(1 - done / frames, entropy)
-            learner.update(batch, gain, epochs, minibatch)
+            learner.update(batch, epochs, minibatch)
             done += len(batch)
             if progress is not None:
-                progress(done, float(gain.sum() / batch["next", "done"].sum()))
+                progress(done, returned)
     finally:
         for env in envs:
             env.close()
@@ -173,6 +176,7 @@ def train_ppo(
 def _roll_batch(
     envs: Sequence[Ending],
     act: Callable[[TensorDictBase], Tensor],
+    reward: RewardFunction,
     frames: int,
     max_steps: int,
     generator: torch.Generator,
@@ -180,7 +184,7 @@ def _roll_batch(
     """Whole episodes of at least this many steps, ``[S]``."""
     rolled: list[TensorDict] = []
     while sum(map(len, rolled)) < frames:
-        rolled.append(roll_episodes(envs, act, max_steps=max_steps, generator=generator))
+        rolled.append(roll_episodes(envs, act, reward, max_steps=max_steps, generator=generator))
     batch: TensorDict = TensorDict.cat(rolled)
     return batch
 
@@ -223,16 +227,15 @@ class _Learner:
         )
         self.returns = RunningValueNorm(shape=1, epsilon=1e-16)
 
-    def value(self, batch: TensorDict, gain: Tensor) -> None:
-        """Write scaled rewards, log-probabilities and advantages into a batch ``[S]``, in place.
+    def value(self, batch: TensorDict) -> None:
+        """Scale rewards, and add log-probabilities and advantages to a batch ``[S]``, in place.
 
         Args:
             batch: Steps of whole episodes, one episode after the other.
-            gain: Reward of each step, ``[S]``.
         """
-        over = batch["next", "done"].squeeze(-1)
-        self.returns.update(running_returns(gain, over, self.discount))
-        batch["next", REWARD] = gain.unsqueeze(-1) / self.returns.scale()
+        gain, over = batch["next", REWARD], batch["next", "done"]
+        self.returns.update(running_returns(gain.squeeze(-1), over.squeeze(-1), self.discount))
+        batch["next", REWARD] = gain / self.returns.scale()
         with torch.no_grad():
             self.advantage(batch)
             batch[_LOG_PROB] = self.actor.get_dist(batch).log_prob(batch[ACTION])
@@ -246,16 +249,15 @@ class _Learner:
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate * left
 
-    def update(self, batch: TensorDict, gain: Tensor, epochs: int, minibatch: int) -> None:
+    def update(self, batch: TensorDict, epochs: int, minibatch: int) -> None:
         """Take gradient steps on minibatches of a batch ``[S]``, in passes over all of it.
 
         Args:
             batch: Steps of whole episodes, one episode after the other.
-            gain: Reward of each step, ``[S]``.
             epochs: Passes over the batch.
             minibatch: Steps in each gradient step.
         """
-        self.value(batch, gain)
+        self.value(batch)
         buffer = ReplayBuffer(
             storage=TensorStorage(batch.exclude("next")),
             sampler=SamplerWithoutReplacement(),
@@ -309,26 +311,3 @@ def _act(
     if spec.discrete:
         return torch.multinomial(output.softmax(-1), 1, generator=generator).squeeze(-1)
     return output + spec.action_std * torch.randn(output.shape, generator=generator)
-
-
-@torch.no_grad()
-def _rewards(reward: RewardFunction, batch: TensorDict, space: gymnasium.Space[Any]) -> Tensor:
-    """Reward of each step of a batch ``[S]``, checked, float32 ``[S]``."""
-    action = clip_actions(space, batch[ACTION])
-    gain = reward(batch[OBSERVATION], action)
-    if not isinstance(gain, Tensor) or not gain.is_floating_point():
-        kind = gain.dtype if isinstance(gain, Tensor) else type(gain).__name__
-        raise TypeError(
-            f"reward must give a floating-point tensor, got {kind}; call .float() on it"
-        )
-    if gain.shape != action.shape[:1]:
-        raise ValueError(
-            f"reward must give one value for each step, shape {list(action.shape[:1])}, got "
-            f"{list(gain.shape)}"
-        )
-    if not bool(gain.isfinite().all()):
-        raise ValueError(
-            f"reward must give finite values, got {int((~gain.isfinite()).sum())} NaN or infinite "
-            f"ones in {len(gain)} steps; look at the network it comes from"
-        )
-    return gain.float()

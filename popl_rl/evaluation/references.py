@@ -1,8 +1,9 @@
 """What a group could get besides: of the data's behaviours, of others' models, of the optimum.
 
 Rows ``behaviour`` (its name as the choice) of each behaviour of the data, ``data`` of all of them
-in the shares of the data, ``best_behaviour`` of the one that is best for a group, and ``optimum``,
-where every transition is known.
+in the shares of the data, ``best_behaviour`` of the one that is best for a group, ``ppo`` of a
+policy that PPO has trained on the group's utility, and ``optimum``, where every transition is
+known.
 """
 
 from collections.abc import Mapping
@@ -17,7 +18,27 @@ from popl_rl.evaluation.measures import group_accuracy
 from popl_rl.evaluation.optimum import ExactReturns
 from popl_rl.evaluation.results import Performance, Rows
 
-__all__ = ["score_behaviours", "score_distributional", "score_optimum"]
+__all__ = ["score_behaviours", "score_distributional", "score_references"]
+
+
+def score_references(
+    rows: Rows, acting: Acting, *, ppo: Performance | None, exact: ExactReturns | None
+) -> None:
+    """Add what G groups could get besides, without any set of policies.
+
+    Args:
+        rows: What is added to.
+        acting: Where the data's behaviours act, see ``score_behaviours``.
+        ppo: What policies do that PPO has trained on the utility of each group, ``[G, E, H]``; None
+            for none.
+        exact: Knows the optimum of each group; None without a transition table.
+    """
+    score_behaviours(rows, acting)
+    if ppo is not None:
+        for index in range(len(rows.groups)):
+            rows.add(("ppo", ""), index, ppo.one(index), torch.ones(1))
+    if exact is not None:
+        _score_optimum(rows, exact)
 
 
 def score_behaviours(rows: Rows, acting: Acting) -> None:
@@ -70,10 +91,8 @@ def score_distributional(
         rows.add_whole((f"dpl_{kind}", ""), "hidden_context", model.hidden_context(bank))
 
 
-def score_optimum(rows: Rows, exact: ExactReturns | None) -> None:
-    """Add the return of the best policy of each group, where every transition is known."""
-    if exact is None:
-        return
+def _score_optimum(rows: Rows, exact: ExactReturns) -> None:
+    """Add the return of the best policy of each group."""
     for index, value in enumerate(exact.optimum.tolist()):
         rows.add_return(("optimum", ""), index, value, error=0.0)
         rows.add_share(("optimum", ""), index, value)

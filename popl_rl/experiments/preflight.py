@@ -21,6 +21,7 @@ from popl_rl.data.environments import World
 from popl_rl.data.rollouts import lockstep, numeric_info
 from popl_rl.experiments.builders import build_spec, check_baselines
 from popl_rl.experiments.data import build_groups, build_world
+from popl_rl.experiments.ppo_policies import check_ppo
 from popl_rl.keys import INFO
 from popl_rl.models.sets import load_set
 from popl_rl.plug_ins import located
@@ -74,6 +75,8 @@ def survey(config: Config) -> Place | None:
             _check_rater(group, episode)
         _check_constant_infos(config.env, world, episode)
         _check_lengths(config, world)
+        if config.evaluation.ppo_reference:
+            check_ppo("evaluation.ppo_reference", world.env)
         spec = build_spec(config.method, world.env)
         if config.evaluation.baselines and config.evaluation.baselines_from is not None:
             path = config.evaluation.baselines_from

@@ -10,6 +10,7 @@ from popl_rl.evaluation.results import Scoreboard
 from popl_rl.experiments.builders import build_spec
 from popl_rl.experiments.data import build_groups, build_world, given_data, make_data
 from popl_rl.experiments.evaluators import make_evaluator
+from popl_rl.experiments.ppo_policies import check_ppo, ppo_policies, tell_cost
 from popl_rl.experiments.report import markdown
 from popl_rl.experiments.run_folder import save_config
 from popl_rl.experiments.run_manifest import check_own_data
@@ -61,7 +62,12 @@ def evaluate_again(config: Config, run_dir: Path, *, seed: int) -> tuple[Path, S
     spec = build_spec(config.method, world.env)
     clone = load_own_set(run_dir, "clone") if (run_dir / "clone").is_dir() else None
     evaluator = make_evaluator(config, world, groups, data, spec, clone=clone, seed=seed)
-    board = evaluator.score(found, baselines, label=config.method.name)
+    ppo = None
+    if config.evaluation.ppo_reference:
+        check_ppo("evaluation.ppo_reference", world.env)
+        tell_cost(config.env, config.raters.groups, world.make)
+        ppo = ppo_policies(config.env, config.raters.groups, world.make)
+    board = evaluator.score(found, baselines, ppo=ppo, label=config.method.name)
     about = {
         "answers of each new rater": config.evaluation.answers,
         "seed": seed,

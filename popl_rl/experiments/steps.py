@@ -28,6 +28,7 @@ from popl_rl.experiments.evaluators import make_evaluator
 from popl_rl.experiments.foresight import Foresight, last_training
 from popl_rl.experiments.loggers import RunLogger, make_logger
 from popl_rl.experiments.metrics import MetricsWriter, write_sizes
+from popl_rl.experiments.ppo_policies import ppo_policies, tell_cost
 from popl_rl.experiments.preflight import Place, check_infos
 from popl_rl.experiments.progress import Progress
 from popl_rl.experiments.report import markdown
@@ -36,6 +37,7 @@ from popl_rl.experiments.run_sets import save_anew
 from popl_rl.experiments.run_start import kept_unless_refused, open_run
 from popl_rl.keys import INFO
 from popl_rl.models.hypothesis_set import HypothesisSet
+from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.models.sets import as_set
 from popl_rl.models.style_population import StyledPopulation
@@ -87,15 +89,19 @@ class References:
     Attributes:
         baselines: Pooled CPL, then the oracle of each group; None if they were not asked for.
         rewards: B-REX and DPL, where items are judged.
+        ppo: A policy for each group that PPO has trained on its utility, if it was asked for.
     """
 
     baselines: HypothesisSet | None
     rewards: RewardBaselines | None
+    ppo: PolicySet | None = None
 
 
 def gather(config: Config, run_dir: Path, place: Place) -> Setting:
     """Collect segments and ask the raters, or load what an earlier run collected."""
     world, groups = place.world, place.groups
+    if config.evaluation.ppo_reference:
+        tell_cost(config.env, config.raters.groups, world.make)
     kept = run_dir / "data"
     has_kept = (kept / "preferences").is_dir()
     load, reader = (kept, None) if has_kept else given_data(config.data)
@@ -200,7 +206,7 @@ def evolve(
 
 
 def train_references(config: Config, setting: Setting, run_dir: Path) -> References:
-    """Pooled CPL, the oracles and, where items are judged, B-REX and DPL."""
+    """Pooled CPL, the oracles, PPO and, where items are judged, B-REX and DPL."""
     options, problem = config.evaluation, setting.problem
     baselines, rewards = None, None
     if options.baselines:
@@ -224,7 +230,10 @@ def train_references(config: Config, setting: Setting, run_dir: Path) -> Referen
             dpl_steps=options.dpl_steps,
             generator=stream(config.seed, "rivals", config.device),
         )
-    return References(baselines, rewards)
+    ppo = None
+    if options.ppo_reference:
+        ppo = ppo_policies(config.env, config.raters.groups, setting.world.make)
+    return References(baselines, rewards, ppo)
 
 
 def evaluate(
@@ -240,6 +249,7 @@ def evaluate(
             found,
             references.baselines,
             reward_baselines=references.rewards,
+            ppo=references.ppo,
             label=config.method.name,
         )
     write_atomic(run_dir / "results.csv", board.results.to_csv(index=False))

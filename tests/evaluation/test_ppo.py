@@ -2,6 +2,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 from popl_rl.evaluation.ppo import reward_of, train_ppo
 from popl_rl.evaluation.ppo_episodes import Ending, roll_episodes, running_returns
@@ -16,9 +17,9 @@ SPEC = PolicySpec(5, 2, discrete=True, hidden=(8,))
 QUICK = {"frames": 200, "frames_per_batch": 100, "num_envs": 5, "max_steps": 20, "epochs": 2}
 
 
-def be_left(observation, action):
+def be_left(steps):
     """1 at the left end, 0 elsewhere; the action does not matter."""
-    return observation[:, 0]
+    return steps["observation"][..., 0]
 
 
 def seeded(seed):
@@ -110,7 +111,7 @@ def test_the_scale_of_a_reward_does_not_matter():
     small, large = (
         train_ppo(
             tiny_env,
-            lambda observation, _, scale=scale: scale * observation[:, 0],
+            lambda steps, scale=scale: scale * be_left(steps),
             SPEC,
             generator=seeded(0),
             **QUICK,
@@ -122,7 +123,7 @@ def test_the_scale_of_a_reward_does_not_matter():
 
 def test_a_reward_without_differences_is_survived():
     policy = train_ppo(
-        tiny_env, lambda o, _: torch.zeros(len(o)), SPEC, generator=seeded(0), **QUICK
+        tiny_env, lambda steps: torch.zeros(steps.shape), SPEC, generator=seeded(0), **QUICK
     )
     assert probabilities(policy).isfinite().all()
 
@@ -144,9 +145,9 @@ def test_continuous_actions_stay_in_bounds_and_learn():
     """Where the reward is the place before the step, moving right is right."""
     actions = []
 
-    def be_right(observation, action):
-        actions.append(action)
-        return observation[:, 0]
+    def be_right(steps):
+        actions.append(steps["action"].flatten())
+        return steps["observation"][..., 0]
 
     spec = PolicySpec.from_env(Slide(), hidden=(8,))
     policy = train_ppo(
@@ -173,7 +174,7 @@ def test_a_constant_decides_whether_an_episode_should_end(gain, leaves):
     """Which it would not if rewards were centred, or if being cut off were an end."""
     policy = train_ppo(
         Exit,
-        lambda o, _: torch.full((len(o),), gain),
+        lambda steps: torch.full(steps.shape, gain),
         PolicySpec(1, 2, discrete=True, hidden=(8,)),
         frames=800,
         frames_per_batch=100,
@@ -192,12 +193,13 @@ def test_a_constant_decides_whether_an_episode_should_end(gain, leaves):
 def test_how_episodes_end(terminates, steps):
     envs = [Ending(Stairs(steps, terminates=terminates)) for _ in range(2)]
     zero = torch.zeros(2, dtype=torch.long)
-    rolled = roll_episodes(envs, lambda _: zero, max_steps=5, generator=seeded(0))
+    rolled = roll_episodes(envs, lambda _: zero, be_left, max_steps=5, generator=seeded(0))
     length = min(steps, 5)
     count = torch.arange(length).repeat(2).unsqueeze(-1)
     last = count == length - 1
     assert torch.equal(rolled["observation"], count.float())
     assert torch.equal(rolled["next", "observation"], count.float() + 1)
+    assert torch.equal(rolled["next", "reward"], count.float())
     assert torch.equal(rolled["next", "done"], last)
     assert torch.equal(rolled["next", "terminated"], last & (terminates and steps <= 5))
 
@@ -212,14 +214,18 @@ def test_running_returns_start_anew_with_each_episode():
 def test_reward_of_discrete_actions():
     rewards = RewardSet(Population.create(RewardSpec(5, 2), 3, generator=seeded(0)))
     observation, action = torch.eye(5), torch.tensor([0, 1, 1, 0, 1])
-    gain = reward_of(rewards, 2)(observation, action)
+    gain = reward_of(rewards, 2)(
+        TensorDict({"observation": observation, "action": action}, [len(action)])
+    )
     assert torch.equal(gain, rewards.reward(observation)[2, torch.arange(5), action])
 
 
 def test_reward_of_continuous_actions():
     rewards = RewardSet(Population.create(RewardSpec(3), 2, generator=seeded(0)))
     observation, action = torch.rand(4, 2), torch.rand(4, 1)
-    gain = reward_of(rewards, 1)(observation, action)
+    gain = reward_of(rewards, 1)(
+        TensorDict({"observation": observation, "action": action}, [len(action)])
+    )
     expected = rewards.reward(torch.cat([observation, action], -1))[1, :, 0]
     torch.testing.assert_close(gain, expected)
 
@@ -262,14 +268,18 @@ def test_numbers_out_of_range(name, value, message):
 @pytest.mark.parametrize(
     ("reward", "error", "message"),
     [
-        (lambda o, _: o[:, 0].log(), ValueError, "reward must give finite values, got .* infinite"),
+        (lambda s: be_left(s).log(), ValueError, "reward must give finite values, got .* infinite"),
         (
-            lambda o, _: o[:, :1],
+            lambda s: s["observation"][..., :1],
             ValueError,
-            r"reward must give one value .*\[100\], got \[100, 1\]",
+            r"reward must give one value .*\[5, 20\], got \[5, 20, 1\]",
         ),
-        (lambda _, a: a, TypeError, r"reward must give a floating-point tensor, got torch\.int64"),
-        (lambda *_: 1.0, TypeError, "reward must give a floating-point tensor, got float"),
+        (
+            lambda s: s["action"],
+            TypeError,
+            r"reward must give a floating-point tensor, got torch\.int64",
+        ),
+        (lambda _: 1.0, TypeError, "reward must give a floating-point tensor, got float"),
     ],
 )
 def test_rewards_that_are_none(reward, error, message):
