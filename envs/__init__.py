@@ -3,5 +3,6 @@
 * ``two_doors``, ``two_doors_alike``: a small grid, solved exactly.
 * ``hidden_utility``, ``hidden_plane``: nothing to learn but what people want.
 * ``delivery``: a grid read from a file, on which real people have compared segments.
+* ``cartpole``: Gymnasium's CartPole, the smallest continuous world.
 * ``metaworld_tasks``: a robot arm at fifty tasks.
 """

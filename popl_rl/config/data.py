@@ -37,6 +37,10 @@ class EnvConfig:
     factory: str = "two_doors"  # registered name, module:attr or file.py:attr
     options: dict[str, Any] = field(default_factory=dict)  # arguments of the factory
     data_options: dict[str, Any] = field(default_factory=dict)  # on top of these, for data only
+    # What the data show: references, see popl_rl.experiments.behaviours; empty for what the
+    # environment itself offers.
+    behaviours: list[str] = field(default_factory=list)
+    noise: list[float] = field(default_factory=lambda: [0.0])  # levels at which each of them acts
     # Share of behaviours in the data, by name or pattern; all alike if empty or null.
     mixture: dict[str, float] | None = field(default_factory=dict)
     id: str | None = None  # id of a Gymnasium environment, for env=gym
@@ -57,6 +61,11 @@ class EnvConfig:
             at.expect(bool(self.id), "id", name, self.id)
         if self.id is not None:
             at.expect(bool(self.id), "id", "an id, or null", self.id)
+        at.expect(all(self.behaviours), "behaviours", "references", self.behaviours)
+        for name, given in (("behaviours", self.behaviours), ("noise", self.noise)):
+            at.expect(len(set(given)) == len(given), name, "different from each other", given)
+        at.expect(bool(self.noise), "noise", "levels, [0] for none", self.noise)
+        at.each(self, "noise", 0)
         if self.mixture:
             proper = all(share >= 0 for share in self.mixture.values())
             proper = proper and abs(sum(self.mixture.values()) - 1) < 1e-6

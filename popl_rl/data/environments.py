@@ -9,7 +9,7 @@ import fnmatch
 import importlib.util
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, cast
 
@@ -82,6 +82,7 @@ def make_world(
     options: Mapping[str, Any] | None = None,
     data_options: Mapping[str, Any] | None = None,
     mixture: Mapping[str, float] | None = None,
+    choose: Callable[["World"], Mapping[str, Behaviour]] | None = None,
 ) -> World:
     """Resolve an environment and read off what it offers.
 
@@ -97,6 +98,8 @@ def make_world(
         options: Further arguments of the factory.
         data_options: What differs from these where segments are collected.
         mixture: Shares of the behaviours, see ``behaviour_shares``.
+        choose: Gives other behaviours in the place of those that the environment has, which may be
+            none; None for these.
 
     Raises:
         ValueError: If the environment cannot be resolved or built, what it offers makes no sense,
@@ -135,17 +138,22 @@ def make_world(
     native = native_spaces(env)[1]
     table = checked_table(offered(env, "transition_table"), factory)
     given = checked_behaviours(offered(env, "behaviours"), factory)
-    behaviours = {
+    behaviours: Mapping[str, Behaviour] = {
         name: table_behaviour(what, first=first)
         if isinstance(what, Tensor)
         else adapt_behaviour(checked_behaviour(what, factory, name, native), native)
         for name, what in given.items()
-    } or {"random": random_behaviour(space)}
-    shares = behaviour_shares(list(behaviours), mixture)
+    }
     collect = None
     if offered(env, "collect_segments") is not None:
         collect = checked_collect(offered(make_for_data(), "collect_segments"), factory)
-    return World(make, make_for_data, env, behaviours, shares, table, collect)
+    world = World(make, make_for_data, env, behaviours, {}, table, collect)
+    if choose is not None:
+        behaviours = choose(world)
+    elif not behaviours:
+        behaviours = {"random": random_behaviour(space)}
+    shares = behaviour_shares(list(behaviours), mixture)
+    return replace(world, behaviours=behaviours, shares=shares)
 
 
 def _prepared(env: Any, factory: str, name: str) -> gymnasium.Env[Any, Any]:

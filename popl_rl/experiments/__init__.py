@@ -2,7 +2,8 @@
 
 - From settings: ``builders`` makes what is learnt, ``data`` the segments and preferences
   (``asked`` keeps which groups gave them), ``label_data`` segments for people to compare, and
-  ``evaluators`` the evaluator; ``ppo_policies`` trains what groups want, and keeps it. Settings objects go no further than this package.
+  ``evaluators`` the evaluator; ``behaviours`` are what the data show, ``ppo_policies`` what groups
+  want. Settings objects go no further than this package.
 - A run's folder: ``run_folder``, ``metrics``, ``loggers``, and its ``report``; ``progress`` and
   ``foresight`` tell how far it is and how long it will take; ``run_manifest``,
   ``run_sets`` and ``plug_ins`` tell whether what is in it belongs together.

@@ -28,6 +28,7 @@ from popl_rl.data.saved import (
 from popl_rl.data.segments import collect_segments, segment_buffer, stored_segments
 from popl_rl.data.store import store_path, stored
 from popl_rl.experiments.asked import check_asked, write_groups
+from popl_rl.experiments.behaviours import chosen_behaviours, policy_digests, ppo_raters
 from popl_rl.experiments.plug_ins import plug_in_digests
 from popl_rl.keys import GROUP, INFO, OBSERVATION
 from popl_rl.manifest import digest_of_tensors
@@ -61,16 +62,18 @@ def build_world(config: EnvConfig) -> World:
     """The environment of a run, see ``popl_rl.data.environments.make_world``.
 
     Raises:
-        ValueError: If the environment cannot be resolved or built, or ``env.mixture`` names
-            behaviours that it does not have.
+        ValueError: If the environment cannot be resolved or built, ``env.mixture`` names behaviours
+            that it does not have, or ``env.behaviours`` what cannot be found.
         TypeError: If it has no behaviours and its actions cannot be drawn at random.
     """
+    is_chosen = bool(config.behaviours) or list(config.noise) != [0.0]
     return make_world(
         config.factory,
         env_id=config.id,
         options=config.options,
         data_options=config.data_options,
         mixture=config.mixture,
+        choose=partial(chosen_behaviours, config) if is_chosen else None,
     )
 
 
@@ -181,12 +184,19 @@ def describe(env: EnvConfig, config: DataConfig, *, seed: int) -> dict[str, Any]
     node = env if isinstance(env, DictConfig) else OmegaConf.structured(env)
     described: Any = OmegaConf.to_container(node, resolve=True)
     described["mixture"] = described["mixture"] or None  # both are equal shares
+    # Of what most worlds leave as it is, the ids of stored segments know nothing.
+    chosen: dict[str, Any] = {}
+    if env.behaviours or list(env.noise) != [0.0]:
+        chosen = {name: described[name] for name in ("behaviours", "noise")}
+        chosen |= {"policies": policy_digests(env)}
+        if ppo_raters(env):
+            chosen["ppo"] = {k: v for k, v in described["ppo"].items() if k != "store"}
     # A file of one's own may be changed; what is installed has a version that somebody chose.
     own = plug_in_digests(described)
     return {
         **({"plug_ins": own} if own else {}),
         "format": 1,
-        "env": {name: described[name] for name in names},
+        "env": {**{name: described[name] for name in names}, **chosen},
         "segments": config.segments,
         "length": config.length,
         "seed": seed,

@@ -21,7 +21,7 @@ __all__ = ["FOLDER", "find_plug_ins", "keep_plug_ins", "plug_in_digests"]
 FOLDER = "plug_ins"
 """Folder of a run for the copies."""
 
-_REFERENCE = re.compile(r"(?P<file>[^:]+\.py):\S")
+_REFERENCE = re.compile(r"(?:ppo:)?(?P<file>[^:]+\.py):\S")
 
 
 def keep_plug_ins(run_dir: Path, config: Any) -> dict[str, Any]:
@@ -125,7 +125,7 @@ def _renamed(value: Any, moved: Mapping[str, str]) -> Any:
         return [_renamed(entry, moved) for entry in value]
     match = _REFERENCE.match(value) if isinstance(value, str) else None
     if match and match["file"] in moved:
-        return moved[match["file"]] + value[len(match["file"]) :]
+        return value[: match.start("file")] + moved[match["file"]] + value[match.end("file") :]
     return value
 
 

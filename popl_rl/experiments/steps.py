@@ -16,6 +16,7 @@ from popl_rl.data.environments import World, indexed, is_stateless
 from popl_rl.evaluation.diagnostics import diagnostics
 from popl_rl.evaluation.evaluator import Evaluator
 from popl_rl.evaluation.results import Scoreboard
+from popl_rl.experiments.behaviours import ppo_raters
 from popl_rl.experiments.builders import (
     build_clone,
     build_method,
@@ -100,11 +101,11 @@ class References:
 def gather(config: Config, run_dir: Path, place: Place) -> Setting:
     """Collect segments and ask the raters, or load what an earlier run collected."""
     world, groups = place.world, place.groups
-    if config.evaluation.ppo_reference:
-        tell_cost(config.env, config.raters.groups, world.make)
     kept = run_dir / "data"
     has_kept = (kept / "preferences").is_dir()
     load, reader = (kept, None) if has_kept else given_data(config.data)
+    wanted = config.raters.groups if config.evaluation.ppo_reference else []
+    tell_cost(config.env, [*wanted, *(ppo_raters(config.env) if load is None else [])], world.make)
     if has_kept:
         check_own_data(run_dir)
     with Progress("segments", total=config.data.segments) as progress:
