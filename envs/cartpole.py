@@ -48,11 +48,13 @@ def balance(step: TensorDictBase, generator: torch.Generator) -> Tensor:  # noqa
 
 
 def _closeness(segments: TensorDictBase, place: float) -> Tensor:
-    return (1 - (segments[OBSERVATION][..., 0] - place).abs()).clamp(min=0)
+    cart: Tensor = segments[OBSERVATION][..., 0]
+    return (1 - (cart - place).abs()).clamp(min=0)
 
 
 def _drive(step: TensorDictBase, place: float) -> Tensor:
     """Lean towards a place and away from speed, and push to where the pole falls from there."""
     cart, speed, angle, turning = step[OBSERVATION].unbind(-1)
     lean = (0.1 * (place - cart) - 0.15 * speed).clamp(-_LEAN, _LEAN)
-    return (angle - lean + 0.3 * turning > 0).long()
+    push: Tensor = angle - lean + 0.3 * turning > 0
+    return push.long()
