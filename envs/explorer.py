@@ -20,7 +20,9 @@ class Explorer:
 
     Args:
         table: The world's transitions.
-        cells: Column and row of every state, ``[S, 2]``.
+        cells: What tells apart the places to go to, in every state, ``[S, K]`` int64: column and
+            row, perhaps with what else can be changed. Where no way leads there, somebody acts at
+            random and then goes elsewhere.
         slip: Chance of a uniformly random action.
     """
 
@@ -29,7 +31,7 @@ class Explorer:
         distinct, self._cell = cells.unique(dim=0, return_inverse=True)
         # Fewest steps from each state to each cell, [cell, state]; never over the goal, where an
         # episode would end.
-        far = torch.tensor(1e6)
+        self._far = far = torch.tensor(1e6)
         distance = torch.where(self._cell == torch.arange(len(distinct)).unsqueeze(1), 0.0, far)
         while True:
             ahead = torch.where(table.terminal, far, 1 + distance[:, table.next_state])
@@ -52,8 +54,12 @@ class Explorer:
         state = step[INFO, "next_state"].long()
         drawn = torch.randint(len(self._targets), state.shape, generator=generator)
         fresh = self._targets[drawn]
-        arrived = self._cell[state] == self._target if len(self._target) else state >= 0
-        self._target = torch.where(arrived, fresh, self._target) if len(self._target) else fresh
+        if len(self._target):
+            arrived = self._cell[state] == self._target
+            astray = self._ahead[self._target, state].amin(-1) >= self._far
+            self._target = torch.where(arrived | astray, fresh, self._target)
+        else:
+            self._target = fresh
         ahead = self._ahead[self._target, state]
         tie_break = torch.rand(ahead.shape, generator=generator) * 0.5
         action = (ahead + tie_break).argmin(-1)

@@ -1,8 +1,9 @@
 """Behaviour to be compared: environments, episodes, segments, and the comparisons of segments.
 
 * ``environments``: environments built from settings; ``tables``: their transitions, solved exactly;
-  ``adapters``: environments of any spaces as learners take them; ``plugged``: environments of other
-  people and what they offer, checked wherever they are called.
+  ``enumeration``: tables found by trying every action; ``adapters``: environments of any spaces as
+  learners take them; ``plugged``: environments of other people and what they offer, checked
+  wherever they are called.
 * ``behaviours``: who acts while data are collected; ``rollouts``: whole episodes in lockstep;
   ``table_rollouts``: the same, looked up in a table.
 * ``segments``: episodes cut into segments; ``store``: segments that several runs share;
