@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 
 from popl_rl.config import plain, validate
 from popl_rl.experiments.cells import Cell, is_finished, results_digest
+from popl_rl.experiments.costs import peak_memory, size_of
 from popl_rl.experiments.progress import without_lines
 from popl_rl.locks import HeldError, locked
 from popl_rl.manifest import sealed
@@ -114,7 +115,13 @@ def _train(task: Task) -> None:
         train_popl.run(config)
         seconds = round(time.perf_counter() - started, 2)
     # Last, as a sign that the cell is finished.
-    record = {**cell.record(), "seconds": seconds, "results": results_digest(folder)}
+    record = {
+        **cell.record(),
+        "seconds": seconds,
+        "disk": size_of(folder),
+        "memory": peak_memory(),
+        "results": results_digest(folder),
+    }
     write_json(folder / "cell.json", sealed(record))
 
 

@@ -3,6 +3,7 @@
 popl-benchmark suite=two_doors                     # goes on where it was stopped
 popl-benchmark suite=smoke seeds=2 workers=4
 popl-benchmark suite=my_suite.yaml run_dir=runs/mine
+popl-benchmark suite=many plan=true                # what it will cost: cells, hours, gigabytes
 popl-benchmark suite=smoke cell=1                  # one cell alone; collect later without cell=
 popl-benchmark -m suite=two_doors 'cell=range(0,60)' hydra/launcher=joblib
 """
@@ -30,6 +31,8 @@ from popl_rl.trainers.command import register_schemas, run_command
 if TYPE_CHECKING:
     import pandas as pd
 
+    from popl_rl.trainers.benchmark_plan import Plan
+
 
 @dataclass
 class BenchmarkConfig:
@@ -40,6 +43,7 @@ class BenchmarkConfig:
     workers: int = 2  # processes, each of which uses one core; 0 for none but this
     run_dir: str | None = None  # folder of the benchmark; runs/benchmark-<suite> if null
     cell: int | None = None  # run this one alone; numbers are in cells.csv
+    plan: bool = False  # say what it will cost, and run nothing
 
 
 @dataclass(frozen=True)
@@ -55,13 +59,7 @@ class Result:
 def run(config: BenchmarkConfig) -> Result:
     """Run the cells that are not finished, and put together what all of them say."""
     # 1. What there is to do.
-    if config.workers < 0:
-        raise ValueError(
-            f"workers must be at least 0, got {config.workers}; 0 works in one process"
-        )
-    suite = load_suite(config.suite, folder=files("popl_rl.configs.suites"))
-    cells = plan(suite, seeds=suite.seeds if config.seeds is None else config.seeds)
-    run_dir = Path(config.run_dir or f"runs/benchmark-{suite.name}")
+    suite, cells, run_dir = _begun(config)
     wanted = cells if config.cell is None else _one(cells, config.cell)
     claim(run_dir, suite, cells)
     unfinished = [cell for cell in wanted if not is_finished(cell, run_dir)]
@@ -93,6 +91,26 @@ def run(config: BenchmarkConfig) -> Result:
     if config.cell is None:
         write_report(run_dir, suite, cells, results, failures)
     return Result(run_dir, suite, results, failures)
+
+
+def foretell(config: BenchmarkConfig) -> "Plan":
+    """What the cells that are not finished will cost."""
+    _, cells, run_dir = _begun(config)
+    tasks = make_tasks([cell for cell in cells if not is_finished(cell, run_dir)], run_dir)
+    with importing():
+        from popl_rl.trainers.benchmark_plan import make_plan
+    return make_plan(cells, tasks, run_dir, config.workers)
+
+
+def _begun(config: BenchmarkConfig) -> tuple[Suite, list[Cell], Path]:
+    """The suite, its cells and the folder."""
+    if config.workers < 0:
+        raise ValueError(
+            f"workers must be at least 0, got {config.workers}; 0 works in one process"
+        )
+    suite = load_suite(config.suite, folder=files("popl_rl.configs.suites"))
+    cells = plan(suite, seeds=suite.seeds if config.seeds is None else config.seeds)
+    return suite, cells, Path(config.run_dir or f"runs/benchmark-{suite.name}")
 
 
 def _one(cells: list[Cell], index: int) -> list[Cell]:
@@ -141,6 +159,11 @@ register_schemas()
 @hydra.main(version_base="1.3", config_path="pkg://popl_rl.configs", config_name="benchmark")
 def main(cfg: Any) -> None:
     """Hydra's entry."""
+    if cfg.plan:
+        from popl_rl.trainers.benchmark_plan import show_plan
+
+        show_plan(foretell(cfg))
+        return
     try:
         result = run(cfg)
     except (KeyboardInterrupt, Terminated) as stop:
