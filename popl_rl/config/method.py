@@ -250,6 +250,9 @@ class MethodConfig:
     evolve: str = "all"  # all: whole networks; head: last layers on a shared, frozen trunk; code:
     # style codes fed to a network that was cloned from the data's behaviour and is frozen
     hidden: list[int] = field(default_factory=lambda: [64, 64])  # units of each hidden layer
+    # Outputs of the convolutions before these, where observations are images; null: 16 and 32 for
+    # whole policy networks, none for others; [] for none.
+    channels: list[int] | None = None
     members: int = 32  # hypotheses in the population; em: as many mixtures as fit
     generations: int = 100  # in which the steps of the training are divided
     training: Training = field(default_factory=Training)
@@ -272,6 +275,16 @@ class MethodConfig:
             return ["training", "popl", "refinement", "mixture"]
         return ["training"]
 
+    def convolutions(self) -> list[int]:
+        """Outputs of each convolution, where observations are images."""
+        if self.channels is None:
+            return [16, 32] if self._can_convolve() else []
+        return list(self.channels)
+
+    def _can_convolve(self) -> bool:
+        # Style codes, and what VPL believes of a rater, are fed to a network beside observations.
+        return self.evolve != "code" and "vpl" not in self.sections() and bool(self.hidden)
+
     def check(self, at: Checker) -> None:
         """Report values that are out of range, or do not go together."""
         at.expect(bool(self.name), "name", "a name", self.name)
@@ -287,6 +300,15 @@ class MethodConfig:
         at.expect(all(units >= 1 for units in self.hidden), "hidden", "positive", self.hidden)
         small = len(self.hidden) <= 100 and all(units <= 10**5 for units in self.hidden)
         at.expect(small, "hidden", "at most 100 layers of at most 1e+05 units", self.hidden)
+        few = [units for units in self.channels or [] if not 1 <= units <= 10**4]
+        at.expect(
+            not few and len(self.channels or []) <= 10,
+            "channels",
+            "at most 10 from 1 to 1e+04",
+            few,
+        )
+        cure = "none for style codes, for VPL, and without hidden layers"
+        at.expect(not self.channels or self._can_convolve(), "channels", cure, self.channels)
         for name in SECTIONS:
             getattr(self, name).check(at.below(name))
         self._check_together(at)

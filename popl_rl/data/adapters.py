@@ -31,6 +31,7 @@ __all__ = [
     "adapt_behaviour",
     "adapted",
     "as_gymnasium",
+    "is_image",
     "native_spaces",
     "observation_names",
 ]
@@ -97,6 +98,12 @@ def native_spaces(env: gymnasium.Env[Any, Any]) -> tuple[spaces.Space[Any], spac
     return cast(
         "tuple[spaces.Space[Any], spaces.Space[Any]]", env.get_wrapper_attr("native_spaces")
     )
+
+
+def is_image(space: spaces.Space[Any]) -> bool:
+    """Whether a space is of pixels, ``[H, W, C]`` or ``[C, H, W]`` with 3 pixels or more a side."""
+    shape = space.shape if isinstance(space, spaces.Box) else None
+    return shape is not None and len(shape) == 3 and sorted(shape)[1] >= 3
 
 
 def _with_flat_observations(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:

@@ -50,7 +50,7 @@ def build_spec(config: MethodConfig, env: gymnasium.Env[Any, Any]) -> PolicySpec
         )
     if config.learns == "reward" or is_stateless(env):
         return RewardSpec.from_env(env, hidden=config.hidden)
-    return PolicySpec.from_env(env, hidden=config.hidden)
+    return PolicySpec.from_env(env, hidden=config.hidden, channels=config.convolutions())
 
 
 def build_clone(
@@ -77,6 +77,8 @@ def build_clone(
     """
     if not isinstance(spec, PolicySpec):
         raise ValueError("a style clone acts, so method.learns must be policy, got reward")
+    # Its network reads codes beside observations, which are no pixels then.
+    spec = replace(spec, image=(), channels=())
     how = config.clone
     settings = (how.code_dim, how.steps, how.beta, *spec.hidden)
     path = path / "-".join(map(str, (f"clone-seed{seed}", *settings)))

@@ -1,6 +1,7 @@
 """Hypotheses about what people want: networks, populations of them, and the sets that are returned.
 
 * ``policies``, ``reward_functions``, ``style_codes``: the kinds of hypotheses, and their sizes.
+* ``convolutions``: what policies begin with where observations are images.
 * ``population``, ``style_population``: many of one kind as one stack of parameters; ``layers`` and
   ``trunk_cache`` make it fast.
 * ``scoring``: scores of segments, margins of comparisons, values of cases.

@@ -1,10 +1,12 @@
 """Policy networks and TorchRL actors, built from an environment's spaces."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import prod
 from typing import Any, Protocol
 
 import gymnasium
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
@@ -12,9 +14,11 @@ from torch import Tensor, nn
 from torch.distributions import Categorical
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor
 
+from popl_rl.data.adapters import is_image, native_spaces
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.behaviours import first_action
 from popl_rl.keys import ACTION, OBSERVATION
+from popl_rl.models.convolutions import image_layers
 
 __all__ = ["CategoricalFrom", "PolicySpec", "Spec", "build_actor", "build_network", "log_prob"]
 
@@ -75,6 +79,10 @@ class PolicySpec:
             2310.13639, section 4). Unused when ``discrete``.
         first_action: Action of the environment that the first output stands for, the start of its
             ``Discrete`` space. Data that policies learn from are counted from 0 all the same.
+        image: Shape of an observation before it was flattened, ``(H, W, C)`` or ``(C, H, W)``,
+            where the network begins with convolutions; else empty.
+        channels: Outputs of each convolution, see ``popl_rl.models.convolutions``.
+        image_scale: What pixels are divided by.
     """
 
     observation_dim: int
@@ -83,6 +91,9 @@ class PolicySpec:
     hidden: tuple[int, ...] = (64, 64)
     action_std: float = 0.5**0.5
     first_action: int = 0
+    image: tuple[int, ...] = ()
+    channels: tuple[int, ...] = ()
+    image_scale: float = 1.0
 
     def __post_init__(self) -> None:
         for name in ("observation_dim", "action_dim"):
@@ -92,6 +103,18 @@ class PolicySpec:
             raise ValueError(f"hidden must hold layer widths of at least 1, got {self.hidden}")
         if not self.action_std > 0:
             raise ValueError(f"action_std must be positive, got {self.action_std}")
+        if bool(self.image) != bool(self.channels):
+            raise ValueError(
+                f"image and channels must both be given or neither, got {self.image} and "
+                f"{self.channels}"
+            )
+        if self.image and (len(self.image) != 3 or prod(self.image) != self.observation_dim):
+            raise ValueError(
+                f"image must be three numbers whose product is observation_dim "
+                f"({self.observation_dim}), got {self.image}"
+            )
+        if self.image and not self.hidden:
+            raise ValueError("hidden must have at least one layer behind convolutions, got none")
 
     @classmethod
     def from_env(
@@ -100,8 +123,16 @@ class PolicySpec:
         *,
         hidden: Sequence[int] = (64, 64),
         action_std: float = 0.5**0.5,
+        channels: Sequence[int] = (),
     ) -> "PolicySpec":
         """Read the sizes off a Gymnasium environment's spaces.
+
+        Args:
+            env: An environment that ``popl_rl.data.adapters`` has adapted.
+            hidden: Units of each hidden layer.
+            action_std: Standard deviation of a continuous policy.
+            channels: Outputs of each convolution, for environments whose observations were images;
+                unused elsewhere.
 
         Raises:
             TypeError: If observations are not a flat ``Box`` or actions neither ``Discrete`` nor a
@@ -122,7 +153,14 @@ class PolicySpec:
                 f"action_space must be Discrete or a Box of one dimension, got {action}"
             )
         first = first_action(action)
-        return cls(observation.shape[0], size, discrete, tuple(hidden), action_std, first)
+        spec = cls(observation.shape[0], size, discrete, tuple(hidden), action_std, first)
+        native = native_spaces(env)[0]
+        if not channels or not is_image(native):
+            return spec
+        high = float(np.max(native.high))  # type: ignore[attr-defined]
+        scale = high if 0 < high < np.inf else 1.0
+        shape = tuple(int(length) for length in native.shape or ())
+        return replace(spec, image=shape, channels=tuple(channels), image_scale=scale)
 
     @property
     def refines(self) -> bool:
@@ -159,21 +197,26 @@ def build_network(spec: Spec, *, generator: torch.Generator) -> nn.Sequential:
         generator: Source of the initial weights.
 
     Returns:
-        The layers of a TorchRL ``MLP`` with ReLU activations.
+        The layers of a TorchRL ``MLP`` with ReLU activations, behind convolutions if there are
+        any; these want observations ``[..., R, O]``.
     """
     seed = int(torch.randint(2**62, (), generator=generator, device=generator.device))
     # torch.nn initialises from the global generator only, so lend it a seed of ours.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
+        # Of policies alone: reward functions read an observation with an action behind it.
+        before, features = list[nn.Module](), spec.observation_dim
+        if isinstance(spec, PolicySpec) and spec.image:
+            before, features = image_layers(spec.image, spec.channels, scale=spec.image_scale)
         layers = MLP(
-            in_features=spec.observation_dim,
+            in_features=features,
             out_features=spec.action_dim,
             num_cells=list(spec.hidden),
             activation_class=nn.ReLU,
             bias_last_layer=spec.output_bias,
         )
     # A plain Sequential, because an MLP cannot be sliced into trunk and head.
-    return nn.Sequential(*layers)
+    return nn.Sequential(*before, *layers)
 
 
 class CategoricalFrom(Categorical):
@@ -214,12 +257,26 @@ class CategoricalFrom(Categorical):
         return CategoricalFrom(logits, first=self.first)
 
 
+class _AnyBatch(nn.Module):
+    """A network of observations ``[R, O]``, for those of any batch size."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, observation: Tensor) -> Tensor:
+        output: Tensor = self.network(observation.reshape(-1, observation.shape[-1]))
+        return output.view(*observation.shape[:-1], -1)
+
+
 def build_actor(spec: PolicySpec, network: nn.Module) -> ProbabilisticActor:
     """Wrap a network ``[..., O] -> [..., K]`` as a TorchRL actor.
 
     It reads ``observation`` and writes ``action`` as the environment takes it, ``[...]`` if
     discrete, else ``[..., A]``.
     """
+    if spec.image:
+        network = _AnyBatch(network)
     if spec.discrete:
         module = TensorDictModule(network, in_keys=[OBSERVATION], out_keys=["logits"])
         if spec.first_action == 0:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
+from popl_rl.models.convolutions import Patches
 from popl_rl.models.layers import apply_layers, change_layers, some_layers
 from popl_rl.models.population import Population
 from popl_rl.models.reward_functions import RewardSpec
@@ -115,6 +116,8 @@ class _Scoring:
             block = min(block, _BLOCK)
         spec = self.spec
         width = max(spec.observation_dim, *spec.hidden, spec.action_dim)
+        cut = [layer for layer in (*self.trunk, *self.layers) if isinstance(layer, Patches)]
+        width = max([width, *(layer.count * layer.features for layer in cut)])
         self.rows = max(1, min(_ROWS, block // width))
         own = spec.action_dim if len(self.layers) == 1 else width
         self.members = max(1, block // (self.rows * own))
