@@ -4,5 +4,6 @@
 * ``hidden_utility``, ``hidden_plane``: nothing to learn but what people want.
 * ``delivery``: a grid read from a file, on which real people have compared segments.
 * ``cartpole``: Gymnasium's CartPole, the smallest continuous world.
+* ``reacher``: MuJoCo's Reacher, quick or smooth.
 * ``metaworld_tasks``: a robot arm at fifty tasks.
 """
