@@ -58,4 +58,5 @@ def _pull(step: TensorDictBase, stiffness: float, damping: float) -> Tensor:
     second = outer * torch.stack([-outer_sin, outer_cos], -1)
     first = second + inner * torch.stack([-sin[:, 0], cos[:, 0]], -1)
     pull = torch.stack([(first * gap).sum(-1), (second * gap).sum(-1)], -1)
-    return (stiffness * pull - damping * speed).clamp(-1, 1)
+    torque: Tensor = (stiffness * pull - damping * speed).clamp(-1, 1)
+    return torque
