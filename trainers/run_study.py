@@ -88,7 +88,7 @@ def _tell_delivery(data: Path, out: Path) -> None:
 
     from popl_rl.config import Config, plain
     from popl_rl.data.readers.opening import open_data
-    from popl_rl.experiments import delivery_study
+    from popl_rl.experiments import delivery_study, response_study
     from popl_rl.experiments.people import people_of
     from popl_rl.experiments.run_manifest import load_run_config
     from popl_rl.plotting.delivery_plots import delivery_walks
@@ -106,11 +106,14 @@ def _tell_delivery(data: Path, out: Path) -> None:
     save(delivery_walks(grid, acting.policies), out / "walks.png")
     info = read.segments["info"]
     walks = info["state"] * grid.actions + info["taken"]
-    fits = delivery_study.response_fits(people, grid, walks)
+    fits = response_study.response_fits(people, grid, walks)
     write_atomic(out / "response.csv", fits.to_csv(index=False))
+    persons = response_study.person_fits(people, grid, walks)
+    write_atomic(out / "response_people.csv", persons.to_csv(index=False))
     means = acting.returns.groupby(["method", "group"])[["greedy", "planned"]].mean()
     print(means.round(3).to_string())
     print(fits.round(3).to_string(index=False))
+    print(persons.describe().loc[["25%", "50%", "75%"]].round(3).to_string())
 
 
 def _with_kinds(rows: "pd.DataFrame", run_dir: Path) -> "pd.DataFrame":

@@ -23,7 +23,6 @@ __all__ = [
     "act_for_people",
     "exact_returns",
     "led_to",
-    "response_fits",
     "step_scores",
 ]
 
@@ -146,46 +145,3 @@ def led_to(group: str) -> str:
     """
     kind = group.partition("-")[0]
     return kind if kind in ("pr", "regret") else ""
-
-
-def response_fits(people: People, grid: Any, walks: Tensor) -> pd.DataFrame:
-    """How people answer, as the response model of simulated raters has it.
-
-    For each condition the partial return and the regret of the two segments are known exactly. The
-    likelihood of the strict answers, ``(1 - slip) sigmoid(beta d) + slip sigmoid(-beta d)`` for a
-    difference d, is maximised for both, on a grid of rationalities beta and slips.
-
-    Args:
-        people: Everybody; with conditions.
-        grid: The delivery grid.
-        walks: Number of the state and action of each step of each segment, ``[N, T]`` (state times
-            actions plus action).
-
-    Returns:
-        Rows ``group, label, rationality, mistake, log_likelihood, answers``.
-    """
-    table = grid.transition_table()
-    reward = table.steps[REWARD]
-    advantage = solve(table, reward, discount=0.999)[0]
-    mask = people.bank.mask
-    there = torch.ones_like(walks, dtype=torch.bool) if mask is None else mask
-    rows = []
-    for group in [*sorted({*people.groups} - {""}), "all"]:
-        chosen = torch.tensor([group in (name, "all") for name in people.groups])
-        own = people.answers.rows(chosen[people.answers.case].nonzero()[:, 0])
-        for label, value in (("return", reward), ("regret", advantage)):
-            score = (value.flatten()[walks] * there).sum(1)
-            difference = score[own.preferred] - score[own.other]
-            rows.append((group, label, *_fit(difference), len(own)))
-    columns = ["group", "label", "rationality", "mistake", "log_likelihood", "answers"]
-    return pd.DataFrame(rows, columns=columns)
-
-
-def _fit(difference: Tensor) -> tuple[float, float, float]:
-    beta = torch.logspace(-2, 1, 31).view(-1, 1, 1)
-    slip = torch.linspace(0, 0.4, 21).view(1, -1, 1)
-    chance = (1 - slip) * (beta * difference).sigmoid() + slip * (-beta * difference).sigmoid()
-    likely = chance.clamp(min=1e-12).log().mean(-1)
-    place = int(likely.argmax())
-    row, column = divmod(place, likely.shape[1])
-    return float(beta[row, 0, 0]), float(slip[0, column, 0]), float(likely[row, column])

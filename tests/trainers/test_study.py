@@ -67,6 +67,10 @@ def test_a_study_of_the_delivery_grid(tmp_path, capsys):
     fits = pd.read_csv(tmp_path / "out" / "response.csv").set_index(["group", "label"])
     fitted = fits["log_likelihood"]
     assert fitted["pr-told", "return"] > fitted["pr-told", "regret"]
+    persons = pd.read_csv(tmp_path / "out" / "response_people.csv").set_index("group")
+    told = persons.loc["pr-told"]  # the others look at what is near to regret
+    assert (told["label"] == "return").all()
+    assert told[["mistake", "tie", "tie_error"]].max().max() == 0
     assert (tmp_path / "out" / "walks.png").is_file()
     assert "How many further answers" in capsys.readouterr().out
 

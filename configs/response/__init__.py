@@ -1,0 +1,1 @@
+"""How raters answer."""
