@@ -4,9 +4,11 @@ popl-study delivery path/to/data                    # runs/study-delivery
 popl-study delivery_policies path/to/data
 popl-study arguments path/to/data --encode tfidf
 popl-study arguments path/to/data --encode path/to/language-model --out runs/mine
+popl-study jailbreaks path/to/data --encode path/to/language-model
 
-The folder holds delivery.npz, or arguments.csv.gz beside arguments_comparisons.csv.gz. Further
-settings are overrides, as of popl-people. The same command goes on after a kill.
+The folder holds delivery.npz, or arguments.csv.gz beside arguments_comparisons.csv.gz, or
+dialogues.jsonl.gz beside jailbreaks.jsonl.gz. Further settings are overrides, as of popl-people.
+The same command goes on after a kill.
 """
 
 import argparse
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["STUDIES", "cli", "main"]
 
-STUDIES = ("delivery", "delivery_policies", "arguments")
+STUDIES = ("delivery", "delivery_policies", "arguments", "jailbreaks")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -40,6 +42,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_intermixed_args(arguments)
     out = given.out or Path("runs", f"study-{given.study}")
     try:
+        if given.study == "jailbreaks":
+            _jailbreaks(given.folder, out, given.encode, given.setting)
+            return 0
         if given.study == "arguments":
             data = _import_arguments(given.folder, out, given.encode)
         else:
@@ -67,6 +72,22 @@ def _config(study: str, data: Path, out: Path, settings: Sequence[str]) -> Any:
         overrides = [f"study={study}", f"data.load={data}", f"run_dir={out / 'comparison'}"]
     with initialize_config_module("popl_rl.configs", version_base="1.3"):
         return compose("people", overrides=[*overrides, *settings])
+
+
+def _jailbreaks(folder: Path, out: Path, encode: str, settings: Sequence[str]) -> None:
+    """Train heads on dialogues, and write and print how they judge."""
+    from popl_rl.config import plain
+    from popl_rl.experiments import jailbreak_study
+
+    config = plain(_config("jailbreaks", folder, out, settings))
+    data = jailbreak_study.read_dialogues(folder, encode, cache=out)
+    rows = jailbreak_study.jailbreak_rows(data, config, methods=tuple(config.people.methods))
+    out.mkdir(parents=True, exist_ok=True)
+    _write_rows("jailbreaks", rows, out)
+    shown = rows[~rows["measure"].str.contains("_low|_high")]
+    table = shown.pivot_table("value", ["method", "choice"], ["measure", "group"], sort=False)
+    print(table.round(3).to_string())
+    print(f"all rows, with their intervals: {out / 'results.csv'}")
 
 
 def _import_arguments(folder: Path, out: Path, encode: str) -> Path:

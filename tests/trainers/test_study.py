@@ -1,5 +1,8 @@
 """Studies, each one command, on small data of the same formats."""
 
+import gzip
+import json
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -100,6 +103,66 @@ def test_a_study_of_arguments(tmp_path):
     assert wants["length"].max() > 0.5
     assert wants["length"].min() < -0.5
     assert "prefers:" in (out / "pairs.md").read_text()
+
+
+@pytest.fixture
+def dialogues(tmp_path):
+    """Helpful people want long replies, harmless ones the word sorry; jailbreaks are long."""
+    rng = np.random.default_rng(2)
+    words = ["tea", "milk", "sun", "rain", "fish", "tree"]
+
+    def reply(size, refuses):
+        return " ".join([*(["sorry"] * refuses), *rng.choice(words, size)])
+
+    with gzip.open(tmp_path / "dialogues.jsonl.gz", "wt") as file:
+        for number in range(400):
+            sizes = rng.choice(np.arange(2, 30), 2, replace=False)
+            refuses = int(rng.integers(2))
+            one, two = (reply(size, refuses != side) for side, size in enumerate(sizes))
+            harmless = number % 2 == 0
+            first = refuses == 1 if harmless else sizes[0] > sizes[1]
+            chosen, rejected = (one, two) if first else (two, one)
+            row = {"prompt": "Human: so?", "objective": "harmless" if harmless else "helpful"}
+            row |= {"chosen": f"Human: so? {chosen}", "rejected": f"Human: so? {rejected}"}
+            file.write(json.dumps(row) + "\n")
+    with gzip.open(tmp_path / "jailbreaks.jsonl.gz", "wt") as file:
+        for _ in range(20):
+            replies = [reply(4, True), reply(40, False)]
+            file.write(json.dumps({"prompt": "Human: do!", "responses": replies}) + "\n")
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_a_study_of_jailbreaks(dialogues, tmp_path, capsys):
+    more = ["method.members=8", "method.generations=5", "method.training.steps=150"]
+    more += ["method.popl.warm_up=20", "people.folds=3", "people.methods=[popl]"]
+    arguments = ["jailbreaks", str(dialogues), "--out", str(tmp_path / "out"), *more]
+    assert run_study.main(arguments) == 0
+    rows = pd.read_csv(tmp_path / "out" / "results.csv", keep_default_na=False)
+    assert list(rows) == COLUMNS
+    value = rows.set_index(["method", "choice", "group", "measure"])["value"]
+    for objective in ("helpful", "harmless"):
+        assert value["oracle", objective, objective, "accuracy"] > 0.9
+        assert value["popl", objective, objective, "gain_over_bradley_terry_low"] > 0
+    assert value["oracle", "helpful", "all", "jailbreaks"] == 1
+    assert value["oracle", "harmless", "all", "jailbreaks"] == 0
+    assert value["popl", "harmless", "all", "jailbreaks_ratio"] < 0.7
+    choices = set(rows[rows["method"] == "dpl_categorical"]["choice"])
+    assert choices == {"expectation", "risk_averse"}
+    assert "jailbreaks" in capsys.readouterr().out
+
+
+def test_dialogues_that_make_no_sense_are_refused(dialogues, tmp_path, capsys):
+    path = dialogues / "dialogues.jsonl.gz"
+    lines = gzip.decompress(path.read_bytes()).replace(b'"harmless"', b'"dull"')
+    path.write_bytes(gzip.compress(lines))
+    arguments = ["jailbreaks", str(dialogues), "--out", str(tmp_path / "out")]
+    assert run_study.main(arguments) == 2
+    assert "objective must be one of helpful, harmless, got {'dull'}" in capsys.readouterr().err
+    with gzip.open(path, "wt") as file:
+        file.write('{"prompt": ""}\n')
+    assert run_study.main(arguments) == 2
+    assert "line 1: chosen, rejected missing" in capsys.readouterr().err
 
 
 def test_returns_of_the_optimum_and_of_random_steps():
