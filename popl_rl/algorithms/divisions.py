@@ -2,9 +2,10 @@
 
 Of two populations that have found the same groups, the larger one predicts better all the same,
 where answers are few: several members share a group, each errs elsewhere, and a rater's answers
-choose among them. That is no reason to count more groups. So a number of niches is judged by the
-best that there is for it: the population of that size, or a larger one, members of which speak
-together, as an ensemble, wherever they serve the raters of one member of the smaller.
+choose among them. That is no reason to count more groups. And a population may have too many
+members for some groups and too few for others, whatever its size. So members that rank alike are
+merged, one pair after the other, and speak together as an ensemble: a number of niches is judged by
+the best division into as many that any population yields.
 """
 
 from typing import NamedTuple
@@ -53,47 +54,66 @@ class Division(NamedTuple):
 def divisions(
     learnt: Problem, judged: Problem, populations: list[tuple[Population, Tensor]]
 ) -> list[Division]:
-    """The best division of raters into as many niches as each population has members.
+    """The best division of raters for each number of niches.
 
     Args:
         learnt: What the populations were trained on.
         judged: The answers of the raters whom they have not learnt of.
-        populations: Populations by their sizes, the smallest first, and the shares of the raters
-            that their members serve.
+        populations: Populations of some sizes, and the shares of the raters that their members
+            serve.
 
     Returns:
-        A division for each population.
+        A division into one niche, into two, and so on to the size of the largest population.
     """
-    margins = [judged.margins(population) for population, _ in populations]
-    served = [responsibility(learnt, population, share) for population, share in populations]
-    best = []
-    for size, few in enumerate(served):
-        found = []
-        for larger in range(size, len(populations)):
-            population, share = populations[larger]
-            niche = merge(served[larger], few)
-            margin = _together(margins[larger], share, niche)
-            value = prediction(margin, judged.comparisons)
-            found.append(Division(population, share, niche, value))
-        best.append(max(found, key=lambda division: float(division.value.mean())))
-    return best
+    best: dict[int, Division] = {}
+    for population, share in populations:
+        margins = judged.margins(population)
+        chance = learnt.margins(population).sigmoid()
+        for niche in merge(chance, share):
+            value = prediction(_together(margins, share, niche), judged.comparisons)
+            number = int(niche.max()) + 1
+            if number not in best or value.mean() > best[number].value.mean():
+                best[number] = Division(population, share, niche, value)
+    return [best[number] for number in sorted(best)]
 
 
-def merge(many: Tensor, few: Tensor) -> Tensor:
-    """Which of a few members each of many others speaks together with.
+def merge(chance: Tensor, share: Tensor) -> list[Tensor]:
+    """Merge members that rank alike, pair by pair, until one niche is left.
+
+    Ward's method (1963): of all pairs of niches, those are merged whose answers differ least, by
+    the squares of the differences times ``share_i share_j / (share_i + share_j)``, so that members
+    whom few raters need are merged before others.
 
     Args:
-        many: How much each of N members serves each rater, ``[N, C]``.
-        few: How much each of K members does, ``[K, C]``.
+        chance: Chance of each of M answers in the eyes of N members, ``[N, M]``.
+        share: Share of the raters that each member serves, ``[N]``, positive.
 
     Returns:
-        For each of the many, the one of the few whose raters it serves most, ``[N]``; numbered
-        anew, without those that get nobody. Members stay apart if ``many`` is ``few``.
+        The niche of each member, ``[N]``, numbered from 0 on in the order of their first members:
+        for N niches, N - 1, ..., 1.
     """
-    if many is few:
-        return torch.arange(len(many), device=many.device)
-    niche: Tensor = (many @ few.T).argmax(1).unique(return_inverse=True)[1]
-    return niche
+    niches = [[member] for member in range(len(share))]
+    weight = share.double().clone()
+    apart = torch.cdist(chance.double(), chance.double()).square()
+    found = [_numbered(niches, share.device)]
+    while len(niches) > 1:
+        both = weight.unsqueeze(1) + weight
+        cost = apart * weight.unsqueeze(1) * weight / both
+        cost.fill_diagonal_(torch.inf)
+        first, second = sorted(divmod(int(cost.argmin()), len(niches)))
+        # Squared distances from the new centre, without working it out.
+        of_first = weight[first] / both[first, second]
+        of_second = 1 - of_first
+        merged = of_first * apart[first] + of_second * apart[second]
+        merged = merged - of_first * of_second * apart[first, second]
+        apart[first], apart[:, first] = merged, merged
+        apart[first, first] = 0.0
+        weight[first] += weight[second]
+        rest = [index for index in range(len(niches)) if index != second]
+        apart, weight = apart[rest][:, rest], weight[rest]
+        niches[first] += niches.pop(second)
+        found.append(_numbered(niches, share.device))
+    return found
 
 
 def responsibility(problem: Problem, population: Population, share: Tensor) -> Tensor:
@@ -127,3 +147,11 @@ def _together(margin: Tensor, share: Tensor, niche: Tensor) -> Tensor:
     """Margins of niches, means over their members by what these serve, ``[N, M] -> [K, M]``."""
     weight = F.one_hot(niche).T.to(margin) * share
     return weight / weight.sum(1, keepdim=True) @ margin
+
+
+def _numbered(niches: list[list[int]], device: torch.device) -> Tensor:
+    """The number of each member's niche."""
+    number = torch.empty(sum(map(len, niches)), dtype=torch.long, device=device)
+    for index, members in enumerate(niches):
+        number[members] = index
+    return number

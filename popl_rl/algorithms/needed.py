@@ -10,7 +10,7 @@ from popl_rl.models.preference_likelihood import leave_one_out, per_case
 
 __all__ = ["Nested", "nested_subsets", "predicted", "sizes_up_to", "sufficient"]
 
-_NEGLIGIBLE = 0.002  # nats of an answer that are not worth a member
+_NEGLIGIBLE = 0.0005  # nats of an answer that are not worth a member
 
 
 def sizes_up_to(most: int) -> list[int]:
@@ -86,7 +86,7 @@ def predicted(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
 def sufficient(behind: Tensor, *, evidence: float) -> int:
     """The smallest of several sets that is hardly behind the best.
 
-    Besides, a set may be behind by 0.2 % in the chance of an answer, however sure that is: where
+    Besides, a set may be behind by 0.05 % in the chance of an answer, however sure that is: where
     raters of one group never err, each further member helps a little.
 
     Args:

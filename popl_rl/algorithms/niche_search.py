@@ -139,7 +139,7 @@ class NicheSearch:
         return [part.start + int(member) for member in alive.nonzero()[:, 0]]
 
     def divisions(self) -> list[Division]:
-        """The best division of the raters for each size, by raters it has not learnt of."""
+        """The best division of the raters for each number of niches, by raters not learnt of."""
         alive = [self.members_of(index) for index in range(len(self.sizes))]
         populations = [(self.stack.subset(one), self.share[one]) for one in alive]
         return divisions(self.problem, self.judged, populations)

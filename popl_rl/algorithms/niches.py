@@ -165,17 +165,21 @@ class NichePOPL:
         for search in self.searches:
             if not search.sizes:
                 search.divide()
-        sizes = min((search.sizes for search in self.searches), key=len)
-        divided = [search.divisions()[: len(sizes)] for search in self.searches]
+        divided = [search.divisions() for search in self.searches]
+        most = min(map(len, divided))
         # Every rater is held out of one search, and its value is 0 in all the others.
-        value = torch.stack([torch.stack([one.value for one in found]) for found in divided]).sum(0)
+        value = torch.stack(
+            [torch.stack([one.value for one in found[:most]]) for found in divided]
+        ).sum(0)
         behind = value[value.mean(1).argmax()] - value
         error = behind.std(1, correction=0) / behind.shape[1] ** 0.5
         chosen = sufficient(behind, evidence=self.settings.evidence)
+        sizes = range(1, most + 1)
         self.sizes = list(zip(sizes, value.mean(1).tolist(), error.tolist(), strict=True))
-        if chosen == len(sizes) - 1:
+        # Where some members serve nobody, there was room for more.
+        if chosen == most - 1 and most == min(search.sizes[-1] for search in self.searches):
             warnings.warn(
-                f"the largest number of members compared, {sizes[-1]}, predicts raters best, so "
+                f"the largest number of members compared, {most}, predicts raters best, so "
                 "there may be more groups than members; raise method.members",
                 stacklevel=2,
             )

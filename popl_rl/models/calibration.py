@@ -14,7 +14,7 @@ SCALES = tuple(2.0**power for power in range(-3, 6))
 #: Chances of a slip that are tried.
 MISTAKES = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 
-_FINE = tuple(2.0 ** (power / 2) for power in range(-10, 5))  # for raters not learnt of
+_COARSE = tuple(2.0**power for power in range(-5, 3))  # for raters not learnt of
 
 
 def fit_scale(margin: Tensor, comparisons: Comparisons, *, mistake: float = MISTAKE) -> float:
@@ -55,7 +55,7 @@ def fit_response(
     For raters whom the members have not learnt of, of whom they may be much too sure: so scales
     down to a thirty-second are tried. As in ``fit_scale``, each answer is predicted by the member
     that its rater's other answers speak for. First the scale is fitted, then the chance of a slip,
-    then the scale again.
+    then the scale again, finer.
 
     Args:
         margin: Margins of the N members on M comparisons, ``[N, M]``.
@@ -73,8 +73,7 @@ def fit_response(
         likelihood = log_likelihood(scale * margin, slip)
         return float(leave_one_out(likelihood, comparisons).mean())
 
-    scale = max(_FINE, key=lambda one: value(one, MISTAKE if mistake is None else mistake))
-    if mistake is not None:
-        return scale, mistake
-    slip = max(MISTAKES, key=lambda one: value(scale, one))
-    return max(_FINE, key=lambda one: value(one, slip)), slip
+    scale = max(_COARSE, key=lambda one: value(one, MISTAKE if mistake is None else mistake))
+    slip = max(MISTAKES, key=lambda one: value(scale, one)) if mistake is None else mistake
+    near = (scale / 2, scale / 2**0.5, scale, scale * 2**0.5, scale * 2)
+    return max(near, key=lambda one: value(one, slip)), slip

@@ -40,7 +40,7 @@ def test_it_finds_as_many_as_there_are(ring, served, groups):
     assert min(served(found, bank, comparisons, group)) > 0.8
     assert metrics[-1]["members"] >= len(found)
     assert all(1 <= row["effective_members"] <= 8.01 for row in metrics)
-    assert [size for size, _, _ in method.sizes] == [1, 2, 3, 5, 8]
+    assert [size for size, _, _ in method.sizes] == list(range(1, len(method.sizes) + 1))
 
 
 def test_each_rater_is_held_out_of_one_search(ring):
@@ -115,7 +115,8 @@ def test_populations_of_several_sizes_train_side_by_side(ring):
     for begin, end in zip([0, *ends], ends, strict=False):
         assert float(search.share[begin:end].sum()) == pytest.approx(1, abs=1e-5)
     found = search.divisions()
-    assert len(found) == len(search.sizes)
+    assert [int(one.niche.max()) + 1 for one in found] == list(range(1, len(found) + 1))
+    assert search.sizes[-2] <= len(found) <= search.sizes[-1]
     for division in found:
         assert division.value.shape == (comparisons.num_cases,)
         assert (division.value[search.raters] == 0).all()

@@ -54,7 +54,7 @@ def test_a_chance_of_slips_that_says_nothing_is_refused():
 
 
 def test_raters_who_err_are_believed_as_much_as_they_deserve():
-    """Right in four answers of five by margins of 50: a scale or slips make that a chance of 0.8."""
+    """Right in four answers of five by margins of 50: scale or slips make that a chance of 0.8."""
     margin = torch.where(torch.arange(200) % 5 == 0, -50.0, 50.0).unsqueeze(0)
     for given in (None, 0.05, 0.2):
         scale, mistake = fit_response(margin, answers(20, 10), mistake=given)
