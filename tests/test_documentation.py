@@ -19,7 +19,10 @@ from popl_rl.trainers import train_popl
 
 ROOT = Path(__file__).parents[1]
 READMES = [Path(f, "README.md") for f in ("", "popl_rl", "envs", "trainers", "configs", "tests")]
-PAGES = [*READMES, *(Path(".github", name) for name in ("CONTRIBUTING.md", "CHANGELOG.md"))]
+PAGES = [
+    *READMES,
+    *(Path(".github", name) for name in ("CONTRIBUTING.md", "CHANGELOG.md", "CLUSTERS.md")),
+]
 TEXT = {page: (ROOT / page).read_text(encoding="utf-8") for page in PAGES}
 CONFIGS = {
     "popl-train": "train",
