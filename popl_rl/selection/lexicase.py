@@ -28,7 +28,7 @@ from torch import Tensor
 from popl_rl.selection.arguments import check_count, check_generator, check_scores
 from popl_rl.selection.behaviours import label_behaviours
 from popl_rl.selection.dynamic_epsilon import select_dynamically
-from popl_rl.selection.epsilon import Epsilon, prepare_scores, tolerance_per_case
+from popl_rl.selection.epsilon import Epsilon, prepare_scores
 from popl_rl.selection.pools import PassPools, ScorePools
 from popl_rl.selection.rounds import Round
 
@@ -145,37 +145,14 @@ def lexicase_report(
     check_generator(generator, scores.device)
 
     scores, tolerance = prepare_scores(scores.detach(), epsilon, epsilon_mode)
-    labels, first = label_behaviours(scores)
-    behaviours = scores if len(first) == len(scores) else scores[first]
     limit = num_cases if cases_per_selection is None else cases_per_selection
     if epsilon_mode == "dynamic" and epsilon == "mad" and tolerance is not None:
+        labels, first = label_behaviours(scores)
         parents, depth = select_dynamically(
             scores, labels, num_selected, limit=limit, generator=generator
         )
-        chosen = labels[parents]
-    else:
-        twins = labels.bincount()
-        if scores.dtype == torch.bool:
-            pools: PassPools | ScorePools = PassPools(behaviours)
-        else:
-            bars = None if tolerance is None else Epsilon(tolerance, scores)
-            pools = ScorePools(behaviours, bars)
-        chosen, depth = Round(pools, twins, limit=limit, generator=generator).select(num_selected)
-        parents = chosen
-        if len(first) < len(scores):
-            # Members sorted by behaviour, and a place among those of the chosen one.
-            draw = torch.rand(
-                num_selected, generator=generator, device=scores.device, dtype=torch.float64
-            )
-            place = (twins.cumsum(0) - twins)[chosen] + (draw * twins[chosen]).long()
-            parents = labels.argsort(stable=True)[place]
-    shares = chosen.bincount() / num_selected
-    return SelectionReport(
-        parents=parents,
-        depth=depth,
-        distinct=len(first),
-        effective=1 / float(shares.square().sum()),
-    )
+        return _report(parents, labels[parents], depth, len(first))
+    return _select(scores, tolerance, num_selected, limit=limit, generator=generator)
 
 
 def lexicase_given_first(
@@ -208,18 +185,42 @@ def lexicase_given_first(
     if first.ndim != 1 or not len(first) or not bool(((first >= 0) & (first < num_cases)).all()):
         raise ValueError(f"first must hold cases in 0..{num_cases - 1}, [selection], got {first}")
     check_generator(generator, scores.device)
-    tolerance = tolerance_per_case(0.0 if epsilon is None else epsilon, scores)
-    values = scores.to(tolerance.dtype)
-    parents, depth = torch.empty_like(first), torch.empty_like(first)
-    cases, group = first.unique(return_inverse=True)
-    for number, case in enumerate(cases.tolist()):
-        column = values[:, case]
-        pool = (column >= column.max() - tolerance[case]).nonzero().squeeze(-1)
-        mine = (group == number).nonzero().squeeze(-1)
-        # Coming back to the first case removes nobody, so the pool may meet all cases.
-        rest = lexicase_report(values[pool], len(mine), epsilon=tolerance, generator=generator)
-        parents[mine] = pool[rest.parents]
-        depth[mine] = rest.depth + int(len(pool) < len(scores))
-    labels, behaviours = label_behaviours(scores)
-    shares = labels[parents].bincount() / len(parents)
-    return SelectionReport(parents, depth, len(behaviours), 1 / float(shares.square().sum()))
+    scores, tolerance = prepare_scores(scores.detach(), epsilon, "semi-dynamic")
+    return _select(scores, tolerance, len(first), limit=num_cases, first=first, generator=generator)
+
+
+def _select(
+    scores: Tensor,
+    tolerance: Tensor | None,
+    num_selected: int,
+    *,
+    limit: int,
+    first: Tensor | None = None,
+    generator: torch.Generator,
+) -> SelectionReport:
+    """Select among behaviours, then a member of each that was chosen."""
+    labels, representative = label_behaviours(scores)
+    distinct = len(representative)
+    behaviours = scores if distinct == len(scores) else scores[representative]
+    twins = labels.bincount()
+    if scores.dtype == torch.bool:
+        pools: PassPools | ScorePools = PassPools(behaviours)
+    else:
+        pools = ScorePools(behaviours, None if tolerance is None else Epsilon(tolerance, scores))
+    turns = Round(pools, twins, limit=limit, generator=generator)
+    chosen, depth = turns.select(num_selected, first)
+    parents = chosen
+    if distinct < len(scores):
+        # Members sorted by behaviour, and a place among those of the chosen one.
+        draw = torch.rand(
+            num_selected, generator=generator, device=scores.device, dtype=torch.float64
+        )
+        place = (twins.cumsum(0) - twins)[chosen] + (draw * twins[chosen]).long()
+        parents = labels.argsort(stable=True)[place]
+    return _report(parents, chosen, depth, distinct)
+
+
+def _report(parents: Tensor, chosen: Tensor, depth: Tensor, distinct: int) -> SelectionReport:
+    """The report on parents, of which the behaviours are ``chosen``."""
+    shares = chosen.bincount() / len(chosen)
+    return SelectionReport(parents, depth, distinct, 1 / float(shares.square().sum()))

@@ -44,8 +44,12 @@ class Round:
         self.known: dict[tuple[int, ...], Tensor] = {}
         self.room = 2**22  # how many numbers ``known`` may still take up
 
-    def select(self, num_selected: int) -> tuple[Tensor, Tensor]:
+    def select(self, num_selected: int, first: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Select behaviours.
+
+        Args:
+            num_selected: Selections.
+            first: Case that each selection's order begins with, ``[num_selected]``; random if None.
 
         Returns:
             The behaviour chosen by each selection, and the place in its order of the last case
@@ -56,14 +60,14 @@ class Round:
         selections = torch.arange(num_selected, device=self.device)
         if len(self.pools.cases):
             for part in torch.split(selections, self.pools.chunk):
-                self._run(part)
+                self._run(part, None if first is None else first[part])
         else:
             everyone = torch.arange(len(self.weights), device=self.device)
             owner = selections.repeat_interleave(len(everyone))
             self.ended.append((owner, everyone.repeat(num_selected)))
         return self._choose(num_selected), self.depth
 
-    def _run(self, selections: Tensor) -> None:
+    def _run(self, selections: Tensor, first: Tensor | None) -> None:
         """Take these selections from full pools to their end, all together."""
         pools, cases = self.pools, self.pools.cases
         pools.open(len(selections))
@@ -71,6 +75,10 @@ class Round:
         skipped = looked  # how much of it is cases on which all members agree
         depth = looked
         drawn = selections.new_empty(0, len(selections))
+        if first is not None:
+            drawn, skipped = self._place_of(first)
+            looked = torch.ones_like(selections)
+            depth = pools.narrow(first[None], None)[0][0].long()
         spent, landmark = 0.0, torch.inf
         length = pools.block
         while True:
@@ -112,6 +120,14 @@ class Round:
         self.depth[selections] = depth
         for selection, place, pool in zip(selections, looked.tolist(), members, strict=True):
             self._settle(selection, place, pool)
+
+    def _place_of(self, first: Tensor) -> tuple[Tensor, Tensor]:
+        """Given cases as draws, ``[1, selection]``, and whether they are aside, ``[selection]``."""
+        cases = self.pools.cases
+        place = torch.searchsorted(cases, first).clamp(max=len(cases) - 1)
+        aside = cases[place] != first
+        # No draw is -1: nothing that comes later is the same case.
+        return place.masked_fill(aside, -1)[None], aside.long()
 
     def _places(
         self, drawn: Tensor, draws: Tensor, looked: Tensor, skipped: Tensor

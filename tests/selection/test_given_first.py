@@ -65,3 +65,20 @@ def test_first_cases_must_exist(first, generator):
     passes = torch.ones(2, 3, dtype=torch.bool)
     with pytest.raises(ValueError, match=r"first must hold cases in 0\.\.2"):
         lexicase_given_first(passes, torch.tensor(first).long(), generator=generator)
+
+
+@pytest.mark.parametrize("first", range(3))
+def test_passes_have_the_enumerated_chances(first, generator):
+    """The case in the middle, on which all agree, removes nobody and still has its place."""
+    passes = torch.tensor(
+        [[1, 1, 0, 1], [0, 1, 1, 0], [1, 1, 1, 0], [0, 1, 0, 1], [1, 1, 0, 1]], dtype=torch.bool
+    )
+    found = lexicase_given_first(passes, torch.full((4000,), first), generator=generator)
+    chance = enumerated(passes.float(), first, torch.zeros(4))
+    counts = found.parents.bincount(minlength=5)
+    assert not counts[chance == 0].any()
+    possible = chance > 0
+    if possible.sum() > 1:
+        assert chisquare(counts[possible], 4000 * chance[possible]).pvalue > 1e-4
+    if first == 1:
+        assert found.depth.min() >= 2
