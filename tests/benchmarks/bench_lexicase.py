@@ -12,7 +12,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from popl_rl.selection.lexicase import lexicase_selection
+from popl_rl.selection.lexicase import lexicase_given_first, lexicase_report, lexicase_selection
+from popl_rl.selection.mad import mad
 
 pytestmark = [pytest.mark.benchmark, pytest.mark.timeout(1800)]
 
@@ -102,6 +103,32 @@ def test_dynamic_epsilon(race: Any) -> None:
         target=0,
         rounds=5,
     )
+
+
+def test_given_first_cases(race: Any) -> None:
+    """A generation of 32 members and 200 raters, beside one selection for each first case."""
+    generator = torch.Generator().manual_seed(1)
+    values = (torch.rand(32, 200, 20, generator=generator) < 0.8).float().mean(-1)
+    tolerance = mad(values)
+    first = torch.randint(200, (32,), generator=generator)
+
+    def one_by_one() -> None:
+        for case in first.unique().tolist():
+            column = values[:, case]
+            pool = values[column >= column.max() - tolerance[case]]
+            count = int((first == case).sum())
+            lexicase_report(pool, count, epsilon=tolerance, generator=generator)
+
+    ratio = race(
+        "32 selections with given first cases, 32 x 200 real scores",
+        lambda: lexicase_given_first(values, first, epsilon=tolerance, generator=generator),
+        one_by_one,
+        rounds=21,
+        reference="one lexicase_report for each first case",
+        target=10,
+        number=5,
+    )
+    assert ratio > 7
 
 
 @pytest.mark.parametrize("share", [0.7, 0.9, 0.99])
