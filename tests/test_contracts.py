@@ -56,12 +56,16 @@ def test_environments(name):
 WITH_ARGUMENTS = {"ring": "ring(1,3)", "blend": "blend(0.3)", "visits": "visits(2)"}
 
 
+#: Raters of environments that are defined elsewhere. A blend is of two coordinates.
+AWAY = {"blend": ("hidden_plane", {})}
+AWAY |= {name: ("gymnasium:make", {"id": "CartPole-v1"}) for name in ("left", "right")}
+
+
 @pytest.mark.parametrize("name", RATERS)
 def test_raters(name):
-    # A blend is of two coordinates.
-    environment = "hidden_plane" if name == "blend" else home(name)
+    environment, arguments = AWAY.get(name, (home(name), {}))
     assert environment is not None, f"no environment is defined beside rater {name!r}"
-    check_rater(WITH_ARGUMENTS.get(name, name), environment)
+    check_rater(WITH_ARGUMENTS.get(name, name), environment, **arguments)
 
 
 @pytest.mark.parametrize("name", ["lexicase", *SELECTIONS])

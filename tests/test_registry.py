@@ -45,12 +45,12 @@ def file(tmp_path, monkeypatch):
 
 
 def test_a_decorated_function_is_unchanged_and_found_by_name():
-    def quick(segments):
+    def hasty(segments):
         return segments
 
-    assert rater("quick")(quick) is quick
-    assert resolve("rater", "quick") is quick
-    assert "quick" in names("rater")
+    assert rater("hasty")(hasty) is hasty
+    assert resolve("rater", "hasty") is hasty
+    assert "hasty" in names("rater")
 
 
 def test_kinds_have_names_of_their_own():

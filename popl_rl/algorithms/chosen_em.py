@@ -25,6 +25,7 @@ __all__ = ["ChosenEM"]
 _SEARCH = 0.3  # of the recipe's generations and steps, in which mixtures of all sizes train
 _HELD_OUT = 5  # one rater in so many is held out of the search
 _EVIDENCE = 0.5  # standard errors by which a smaller mixture may predict raters worse
+_NEGLIGIBLE = 0.002  # nats of an answer that are not worth a component, whatever the evidence
 
 
 class ChosenEM:
@@ -108,7 +109,9 @@ class ChosenEM:
         error = behind.std(1, correction=0) / behind.shape[1] ** 0.5
         size = [mixture.share.shape[1] for mixture in self.mixtures]
         self.sizes = list(zip(size, value.mean(1).tolist(), error.tolist(), strict=True))
-        self.found = self._mixture(size[sufficient(behind, evidence=_EVIDENCE)])
+        self.found = self._mixture(
+            size[sufficient(behind, evidence=_EVIDENCE, negligible=_NEGLIGIBLE)]
+        )
 
     def _mixture(self, groups: int) -> EM:
         return EM(self.problem, em=EMSettings(groups=groups), generator=self.generator)

@@ -83,18 +83,19 @@ def predicted(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
     return per_case(leave_one_out(likelihood, comparisons), comparisons) / count
 
 
-def sufficient(behind: Tensor, *, evidence: float) -> int:
+def sufficient(behind: Tensor, *, evidence: float, negligible: float = _NEGLIGIBLE) -> int:
     """The smallest of several sets that is hardly behind the best.
 
-    Besides, a set may be behind by 0.05 % in the chance of an answer, however sure that is: where
-    raters of one group never err, each further member helps a little.
+    Besides, a set may be behind by a little, however sure that is: where raters of one group never
+    err, each further member helps a bit.
 
     Args:
         behind: How far each set is behind the best in the prediction of each rater, ``[S, C]``, the
             sets by their sizes.
         evidence: Standard errors, paired over raters, by which a set may be behind; with 0 the best
             is taken, with 1 the rule is the one of Breiman et al. (1984).
+        negligible: Nats of an answer by which a set may be behind in any case.
     """
     error = behind.std(1, correction=0) / behind.shape[1] ** 0.5
-    good = behind.mean(1) <= (evidence * error).clamp(min=_NEGLIGIBLE)
+    good = behind.mean(1) <= (evidence * error).clamp(min=negligible)
     return int(good.float().argmax())

@@ -50,7 +50,7 @@ def build_spec(config: MethodConfig, env: gymnasium.Env[Any, Any]) -> PolicySpec
         )
     if config.learns == "reward" or is_stateless(env):
         return RewardSpec.from_env(env, hidden=config.hidden)
-    return PolicySpec.from_env(env, hidden=config.hidden, channels=config.convolutions())
+    return PolicySpec.from_env(env, hidden=config.hidden, channels=plain(config).convolutions())
 
 
 def build_clone(
