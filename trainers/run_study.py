@@ -8,7 +8,7 @@ popl-study jailbreaks path/to/data --encode path/to/language-model
 
 The folder holds delivery.npz, or arguments.csv.gz beside arguments_comparisons.csv.gz, or
 dialogues.jsonl.gz beside jailbreaks.jsonl.gz. Further settings are overrides, as of popl-people.
-The same command goes on after a kill.
+The same command goes on after a kill; of jailbreaks, features of texts alone are kept.
 """
 
 import argparse

@@ -13,7 +13,13 @@ import torch
 from torch import Tensor
 
 from popl_rl.algorithms.em import EM
-from popl_rl.algorithms.needed import predicted, sizes_up_to, sufficient
+from popl_rl.algorithms.needed import (
+    behind_best,
+    predicted,
+    sizes_up_to,
+    standard_error,
+    sufficient,
+)
 from popl_rl.algorithms.problem import Problem
 from popl_rl.config import EMSettings
 from popl_rl.models.hypothesis_set import HypothesisSet
@@ -105,13 +111,12 @@ class ChosenEM:
 
     def _settle(self) -> None:
         value = torch.stack([self._value(mixture.result().population) for mixture in self.mixtures])
-        behind = value[value.mean(1).argmax()] - value
-        error = behind.std(1, correction=0) / behind.shape[1] ** 0.5
+        behind = behind_best(value)
         size = [mixture.share.shape[1] for mixture in self.mixtures]
-        self.sizes = list(zip(size, value.mean(1).tolist(), error.tolist(), strict=True))
-        self.found = self._mixture(
-            size[sufficient(behind, evidence=_EVIDENCE, negligible=_NEGLIGIBLE)]
-        )
+        mean, error = value.mean(1).tolist(), standard_error(behind).tolist()
+        self.sizes = list(zip(size, mean, error, strict=True))
+        chosen = sufficient(behind, evidence=_EVIDENCE, negligible=_NEGLIGIBLE)
+        self.found = self._mixture(size[chosen])
 
     def _mixture(self, groups: int) -> EM:
         return EM(self.problem, em=EMSettings(groups=groups), generator=self.generator)

@@ -25,6 +25,7 @@ from torch import Tensor
 from popl_rl.algorithms.draws import by_comparison
 from popl_rl.algorithms.expectation import Expectation, expect
 from popl_rl.algorithms.losses import CPLLoss, cpl_loss, descend
+from popl_rl.algorithms.needed import behind_best
 from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.variation import inherit_moments
 from popl_rl.config import MixtureSettings
@@ -159,7 +160,7 @@ class MixturePOPL:
     def result(self) -> HypothesisSet:
         """The smallest mixture that is as good as the best, trained once more and scaled."""
         _, robust = self._held_out()
-        behind = robust[robust.mean(1).argmax()] - robust
+        behind = behind_best(robust)
         # One-standard-error rule: a bigger mixture has to earn its members.
         error = behind.std(1) / behind.shape[1] ** 0.5
         size = self.active.sum(1)

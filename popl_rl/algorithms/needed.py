@@ -8,7 +8,15 @@ from torch import Tensor
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.preference_likelihood import leave_one_out, per_case
 
-__all__ = ["Nested", "nested_subsets", "predicted", "sizes_up_to", "sufficient"]
+__all__ = [
+    "Nested",
+    "behind_best",
+    "nested_subsets",
+    "predicted",
+    "sizes_up_to",
+    "standard_error",
+    "sufficient",
+]
 
 _NEGLIGIBLE = 0.0005  # nats of an answer that are not worth a member
 
@@ -83,6 +91,21 @@ def predicted(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
     return per_case(leave_one_out(likelihood, comparisons), comparisons) / count
 
 
+def behind_best(value: Tensor) -> Tensor:
+    """How far each of several sets is behind the one of the best mean, ``[S, C] -> [S, C]``.
+
+    Args:
+        value: How well each set predicts each rater, higher is better.
+    """
+    return value[value.mean(1).argmax()] - value
+
+
+def standard_error(behind: Tensor) -> Tensor:
+    """Standard error of how far sets are behind, paired over raters, ``[S, C] -> [S]``."""
+    error: Tensor = behind.std(1, correction=0) / behind.shape[1] ** 0.5
+    return error  # 0 for a single rater, who has no spread to judge by
+
+
 def sufficient(behind: Tensor, *, evidence: float, negligible: float = _NEGLIGIBLE) -> int:
     """The smallest of several sets that is hardly behind the best.
 
@@ -90,12 +113,10 @@ def sufficient(behind: Tensor, *, evidence: float, negligible: float = _NEGLIGIB
     err, each further member helps a bit.
 
     Args:
-        behind: How far each set is behind the best in the prediction of each rater, ``[S, C]``, the
-            sets by their sizes.
+        behind: As of ``behind_best``, the sets by their sizes.
         evidence: Standard errors, paired over raters, by which a set may be behind; with 0 the best
             is taken, with 1 the rule is the one of Breiman et al. (1984).
         negligible: Nats of an answer by which a set may be behind in any case.
     """
-    error = behind.std(1, correction=0) / behind.shape[1] ** 0.5
-    good = behind.mean(1) <= (evidence * error).clamp(min=negligible)
+    good = behind.mean(1) <= (evidence * standard_error(behind)).clamp(min=negligible)
     return int(good.float().argmax())

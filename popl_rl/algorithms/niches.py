@@ -3,9 +3,10 @@
 Several searches (see ``popl_rl.algorithms.niche_search``) run side by side, and each rater is held
 out of one. In the first part of a search, members divide the raters among themselves, and lexicase
 selects the parents of new members. In the second, populations of several sizes train on. The raters
-who were held out tell which size predicts people whom it has not learnt of best, and the smallest
-that is hardly worse is taken. At last, fresh members are trained by the whole recipe on the
-division of the raters that was found: what was learnt while it was wrong would stay otherwise.
+who were held out tell how many niches predict people whom nobody has learnt of best, of all numbers
+(see ``popl_rl.algorithms.divisions``), and the smallest that is hardly worse is taken. At last,
+fresh members are trained by the whole recipe on the division of the raters that was found: what was
+learnt while it was wrong would stay otherwise.
 """
 
 import warnings
@@ -15,7 +16,7 @@ import torch
 from torch import Tensor
 
 from popl_rl.algorithms.divisions import Division, prediction, responsibility
-from popl_rl.algorithms.needed import sufficient
+from popl_rl.algorithms.needed import behind_best, standard_error, sufficient
 from popl_rl.algorithms.niche_search import NicheSearch, descend_served
 from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.stacked_adam import StackedAdam
@@ -171,11 +172,10 @@ class NichePOPL:
         value = torch.stack(
             [torch.stack([one.value for one in found[:most]]) for found in divided]
         ).sum(0)
-        behind = value[value.mean(1).argmax()] - value
-        error = behind.std(1, correction=0) / behind.shape[1] ** 0.5
+        behind = behind_best(value)
         chosen = sufficient(behind, evidence=self.settings.evidence)
-        sizes = range(1, most + 1)
-        self.sizes = list(zip(sizes, value.mean(1).tolist(), error.tolist(), strict=True))
+        mean, error = value.mean(1).tolist(), standard_error(behind).tolist()
+        self.sizes = list(zip(range(1, most + 1), mean, error, strict=True))
         # Where some members serve nobody, there was room for more.
         if chosen == most - 1 and most == min(search.sizes[-1] for search in self.searches):
             warnings.warn(

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from popl_rl.algorithms.expectation import expect
 from popl_rl.algorithms.losses import CPLLoss
-from popl_rl.algorithms.needed import nested_subsets
+from popl_rl.algorithms.needed import behind_best, nested_subsets, sufficient
 from popl_rl.algorithms.problem import Problem
 from popl_rl.config import RefinementSettings
 from popl_rl.data.comparisons import Comparisons
@@ -42,11 +42,7 @@ def smallest_subset(likelihood: Tensor, comparisons: Comparisons, *, most: int =
         Members, the most useful one first.
     """
     order, value = nested_subsets(likelihood, comparisons, most=most)
-    behind = value[value.mean(1).argmax()] - value
-    # A single case has no spread to judge by.
-    error = behind.std(1, correction=0) / behind.shape[1] ** 0.5
-    good = behind.mean(1) <= error
-    return order[: int(good.float().argmax()) + 1]
+    return order[: sufficient(behind_best(value), evidence=1.0, negligible=0.0) + 1]
 
 
 def refine(

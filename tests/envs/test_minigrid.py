@@ -146,7 +146,9 @@ def test_the_readme_lists_another_world_of_minigrid(tmp_path):
 
 def test_gymnasium_knows_them():
     for name in ("LavaGap", "DoorKey", "DynamicObstacles"):
-        gymnasium.make(f"popl_rl/{name}-v0").reset(seed=0)
+        made = gymnasium.make(f"popl_rl/{name}-v0")
+        observation, _ = made.reset(seed=0)
+        assert made.observation_space.contains(observation)
 
 
 @pytest.mark.parametrize(
