@@ -5,6 +5,7 @@ Pure functions of scores ``[member, case]``; nothing here imports other parts of
 * ``lexicase``: lexicase selection, plain and with epsilon; its parts are ``behaviours`` (members
   that score alike), ``epsilon`` and ``dynamic_epsilon`` (how far behind the best one may be),
   ``pools`` (the members left) and ``rounds`` (the order of cases).
+* ``compiled`` and ``kernels``: selection on passes by numba, where that is installed.
 * ``rules``: tournaments, best sum, random parents, NSGA-II.
 * ``downsampling``: which cases to score, and which raters to take; by ``farthest_first`` traversal.
 * ``mad``: the median absolute deviation.

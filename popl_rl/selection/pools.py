@@ -4,9 +4,12 @@
 Nothing here checks its arguments.
 """
 
+from functools import lru_cache
+
 import torch
 from torch import Tensor
 
+from popl_rl.selection.compiled import kernels_for
 from popl_rl.selection.epsilon import Epsilon
 
 __all__ = ["PassPools", "ScorePools"]
@@ -25,15 +28,19 @@ class PassPools:
 
     def __init__(self, passes: Tensor) -> None:
         self.scores = passes.contiguous().view(torch.uint8)
-        self.packed = _pack(self.scores)  # [member / 8, case]
-        mixed = (self.packed.amax(0) > 0).logical_and_(self.packed.amin(0) < 255)
+        self.kernels = kernels_for(passes)
+        if self.kernels is None:
+            self.packed = _pack(self.scores)  # [member / 8, case]
+            mixed = (self.packed.amax(0) > 0).logical_and_(self.packed.amin(0) < 255)
+        else:
+            self.packed = torch.from_numpy(self.kernels.pack(self.scores.numpy()))
+            mixed = torch.from_numpy(self.kernels.mixed(self.packed.numpy()))
         self.cases = mixed.nonzero().view(-1)
         # After this many cases that half the members pass, one pool in 256 is still undecided.
         self.block = (len(passes) - 1).bit_length() + 8
         self.chunk = max(1, 2**24 // (self.block * len(self.packed)))
-        bits = torch.arange(8, device=passes.device)
-        self.set_bits = (torch.arange(256, device=passes.device)[:, None] >> bits) & 1
-        self.num_set = self.set_bits.sum(1)
+        self.set_bits, self.num_set = _bits_of_bytes(passes.device)
+        self.last = 255 >> -len(passes) % 8  # of the last byte: no bit stands for no member
 
     def most(self, num_selections: int) -> int:
         """Longest block of draws that fits into memory."""
@@ -42,19 +49,27 @@ class PassPools:
     def open(self, num_selections: int) -> None:
         """Start this many selections, each with every member in its pool."""
         self.bits = self.packed.new_full((len(self.packed), num_selections), 255)
-        self.bits[-1] >>= -len(self.scores) % 8  # no bit stands for no member
+        self.bits[-1].fill_(self.last)
 
-    def narrow(self, cases: Tensor, closed: Tensor | None) -> tuple[Tensor, int]:
+    def narrow(self, cases: Tensor, places: Tensor, limit: int) -> tuple[Tensor, Tensor, int]:
         """Filter each pool by its cases in turn.
 
         Args:
             cases: Which case comes next, ``[step, selection]``.
-            closed: Where the case does not count any more, ``[step, selection]``; None if nowhere.
+            places: Place of each in its selection's order, ``[step, selection]``.
+            limit: Place of the last case that counts.
 
         Returns:
-            Where members were removed, ``[step, selection]``, and the nanoseconds it took.
+            Place of the last case that removed a member, 0 if none did, and members left in each
+            pool, ``[selection]`` each, and the nanoseconds it took.
         """
         steps, selections = cases.shape
+        if self.kernels is not None:
+            pools, order = (self.packed.numpy(), self.bits.numpy()), (cases.numpy(), places.numpy())
+            depth, sizes = self.kernels.narrow(*pools, *order, limit, self.num_set.numpy())
+            work = cases.numel() * len(self.packed)
+            return torch.from_numpy(depth), torch.from_numpy(sizes), work
+        closed = _closed(places, limit, self.scores.shape[1])
         passed = self.packed.gather(1, cases.reshape(-1).expand(len(self.packed), -1))
         passed = passed.view(-1, steps, selections)
         history = [self.bits]
@@ -66,11 +81,8 @@ class PassPools:
             self.bits = kept.bitwise_or_(self.bits * spared)
             history.append(self.bits)
         narrowed = torch.stack(history).diff(dim=0).amax(1) > 0
-        return narrowed, passed.numel()
-
-    def sizes(self) -> Tensor:
-        """Members left in each pool, ``[selection]``."""
-        return self.num_set.take(self.bits.long()).sum(0)
+        sizes = self.num_set.take(self.bits.long()).sum(0)
+        return (places * narrowed).amax(0), sizes, passed.numel()
 
     def keep(self, selections: Tensor) -> None:
         """Go on with the selections at these indices only."""
@@ -82,10 +94,22 @@ class PassPools:
         Returns:
             Position in ``selections``, and member, of each pair, ``[pair]`` each.
         """
+        if self.kernels is not None:
+            who = (self.bits.numpy(), selections.numpy(), self.num_set.numpy())
+            ends, ended = self.kernels.members(*who)
+            return torch.from_numpy(ends), torch.from_numpy(ended)
         bits = self.bits.index_select(1, selections)
         byte, owner = bits.nonzero().unbind(1)
         pair, bit = self.set_bits[bits[byte, owner].long()].nonzero().unbind(1)
         return owner.take(pair), 8 * byte.take(pair) + bit
+
+
+@lru_cache
+def _bits_of_bytes(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Bits of each byte, ``[256, 8]``, and how many of them are set, ``[256]``."""
+    bits = torch.arange(8, device=device)
+    set_bits = (torch.arange(256, device=device)[:, None] >> bits) & 1
+    return set_bits, set_bits.sum(1)
 
 
 def _pack(flags: Tensor) -> Tensor:
@@ -102,6 +126,11 @@ def _pack(flags: Tensor) -> Tensor:
     return packed
 
 
+def _closed(places: Tensor, limit: int, num_cases: int) -> Tensor | None:
+    """Where a case does not count any more, ``[step, selection]``; None if nowhere."""
+    return places > limit if limit < num_cases else None
+
+
 class ScorePools:
     """Pools of members with real scores, as a list of (selection, member) pairs.
 
@@ -113,6 +142,7 @@ class ScorePools:
     """
 
     block = 1
+    kernels = None
 
     def __init__(self, scores: Tensor, epsilon: Epsilon | None) -> None:
         self.scores = scores.contiguous()
@@ -136,8 +166,9 @@ class ScorePools:
         self.owner = self.member = self.cases.new_empty(0)
         self.size = self.cases.new_full((num_selections,), len(self.scores))
 
-    def narrow(self, cases: Tensor, closed: Tensor | None) -> tuple[Tensor, int]:
+    def narrow(self, cases: Tensor, places: Tensor, limit: int) -> tuple[Tensor, Tensor, int]:
         """Filter each pool by its case; see `PassPools.narrow`."""
+        closed = _closed(places, limit, self.scores.shape[1])
         case = cases[0]
         if self.full:
             values = self.scores.gather(1, case.expand(len(self.scores), -1))
@@ -158,15 +189,11 @@ class ScorePools:
             stay = kept.nonzero().view(-1)
             self.member, self.owner = self.member.gather(0, stay), self.owner.gather(0, stay)
         before, self.size = self.size, self.owner.bincount(minlength=len(case))
-        return (self.size < before)[None], 30 * values.numel()
+        return places[0] * (self.size < before), self.size, 30 * values.numel()
 
     def _spread(self, by_selection: Tensor) -> Tensor:
         """Give each pair what belongs to its selection."""
         return by_selection if self.full else by_selection.gather(0, self.owner)
-
-    def sizes(self) -> Tensor:
-        """Members left in each pool, ``[selection]``."""
-        return self.size
 
     def keep(self, selections: Tensor) -> None:
         """Go on with the selections at these indices only."""

@@ -78,7 +78,7 @@ class Round:
         if first is not None:
             drawn, skipped = self._place_of(first)
             looked = torch.ones_like(selections)
-            depth = pools.narrow(first[None], None)[0][0].long()
+            depth = pools.narrow(first[None], looked[None], self.limit)[0]
         spent, landmark = 0.0, torch.inf
         length = pools.block
         while True:
@@ -87,19 +87,17 @@ class Round:
             drawn = torch.cat([drawn, draws])
             places, skipped = self._places(drawn, draws, looked, skipped)
             looked = places[-1]
-            closed = places > self.limit if self.limit < self.num_cases else None
-            narrowed, work = pools.narrow(cases.take(draws), closed)
-            depth = torch.maximum(depth, (places * narrowed).amax(0))
+            found, sizes, work = pools.narrow(cases.take(draws), places, self.limit)
+            depth = torch.maximum(depth, found)
 
-            sizes = pools.sizes()
             done = (sizes == 1).logical_or_(looked >= self.limit)
             over = done.nonzero().view(-1)
-            if len(over):
+            if ending := len(over):
                 owner, member = pools.members(over)
                 ended = selections.take(over)
                 self.ended.append((ended.take(owner), member))
                 self.depth[ended] = depth.take(over)
-                if len(over) == len(selections):
+                if ending == len(selections):
                     return
                 left = (~done).nonzero().view(-1)
                 pools.keep(left)
@@ -137,10 +135,14 @@ class Round:
         A case drawn again takes no new place. The cases that were set aside because they split
         nobody stand in the order too, between the draws.
         """
+        aside = self.num_cases - len(self.pools.cases)
+        kernels = self.pools.kernels
+        if kernels is not None and not aside:
+            places = kernels.places(drawn.numpy(), len(draws), looked.numpy(), self.num_cases)
+            return torch.from_numpy(places), skipped
         ordered, order = drawn.sort(dim=0, stable=True)  # equal draws side by side, the first first
         fresh = torch.ones_like(drawn, dtype=torch.bool)
         fresh = fresh.scatter_(0, order[1:], ordered[1:] != ordered[:-1])[-len(draws) :]
-        aside = self.num_cases - len(self.pools.cases)
         if not aside:
             return looked + fresh.cumsum(0), skipped
         places = torch.empty_like(draws)

@@ -5,6 +5,7 @@
 How it grows: growth.py.
 """
 
+from importlib.util import find_spec
 from typing import Any
 
 import lexicase as reference
@@ -63,11 +64,11 @@ def test_small_population(race: Any) -> None:
         lambda: reference.lexicase_selection(passes.numpy(), 100),
         rounds=21,
         reference=THEIRS,
-        target=10,
+        target=15,
         number=20,
     )
-    # About 250 calls into torch take a millisecond, however small their tensors.
-    assert ratio > 4
+    # About 250 calls into torch take a millisecond, however small their tensors; numba saves most.
+    assert ratio > (4 if find_spec("numba") is None else 12)
 
 
 def test_median_absolute_deviation(race: Any) -> None:
