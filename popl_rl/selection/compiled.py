@@ -29,6 +29,6 @@ def find_kernels() -> ModuleType | None:
     """The kernels, or None if numba is not installed."""
     if find_spec("numba") is None:
         return None
-    from popl_rl.selection import kernels  # half a second, which only passes need
+    from popl_rl.selection import kernels  # a moment to load, which only passes need
 
     return kernels
