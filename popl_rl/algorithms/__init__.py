@@ -9,8 +9,9 @@ Nothing here imports raters: a learner cannot see who voted.
 ``popl``: POPL; ``assembly``: POPL from its settings; ``refinement``: its last training;
 ``mixture_population``: POPL without rater ids.
 ``niches``: POPL for any number of groups; ``niche_search``: one of its searches; ``divisions``:
-how it divides raters; ``specialists``: a member for a rater; ``needed``: which members, and how
-many, raters need; ``stacked_adam``: an optimiser for a population that grows and shrinks.
+how it divides raters; ``agreement``: what searches agree upon; ``specialists``: a member for a
+rater; ``needed``: which members, and how many, raters need; ``stacked_adam``: an optimiser for a
+population that grows and shrinks.
 ``multi_cpl``: CPL ensembles; ``cpl``: pooled CPL and the oracle; ``em``: EM mixtures;
 ``chosen_em``: EM that is not told how many; ``kmeans``: clusters of raters first; ``vpl``: a latent
 variable; ``lore``: low-rank reward functions; ``brex``, ``dpl``, ``reward_baselines``: reward

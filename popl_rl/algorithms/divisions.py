@@ -22,7 +22,7 @@ from popl_rl.models.calibration import fit_response
 from popl_rl.models.population import Population
 from popl_rl.models.preference_likelihood import log_likelihood, per_case
 
-__all__ = ["Division", "divisions", "merge", "prediction", "responsibility"]
+__all__ = ["Division", "divisions", "merge", "prediction", "responsibility", "together"]
 
 
 class Division(NamedTuple):
@@ -43,12 +43,7 @@ class Division(NamedTuple):
 
     def margins(self, problem: Problem) -> Tensor:
         """Margins of the niches on the comparisons of a problem, ``[K, M]``."""
-        return _together(problem.margins(self.population), self.share, self.niche)
-
-    def served(self, problem: Problem) -> Tensor:
-        """How much each niche serves each rater of a problem, ``[K, C]``."""
-        each = responsibility(problem, self.population, self.share)
-        return F.one_hot(self.niche).T.to(each) @ each
+        return together(problem.margins(self.population), self.share, self.niche)
 
 
 def divisions(
@@ -70,7 +65,7 @@ def divisions(
         margins = judged.margins(population)
         chance = learnt.margins(population).sigmoid()
         for niche in merge(chance, share):
-            value = prediction(_together(margins, share, niche), judged.comparisons)
+            value = prediction(together(margins, share, niche), judged.comparisons)
             number = int(niche.max()) + 1
             if number not in best or value.mean() > best[number].value.mean():
                 best[number] = Division(population, share, niche, value)
@@ -143,9 +138,19 @@ def prediction(margin: Tensor, comparisons: Comparisons) -> Tensor:
     return predicted(log_likelihood(scale * margin, mistake), comparisons)
 
 
-def _together(margin: Tensor, share: Tensor, niche: Tensor) -> Tensor:
-    """Margins of niches, means over their members by what these serve, ``[N, M] -> [K, M]``."""
+def together(margin: Tensor, share: Tensor, niche: Tensor) -> Tensor:
+    """Margins of niches: means over their members, by what these serve.
+
+    Args:
+        margin: Margins of N members on M comparisons, ``[N, M]``.
+        share: Share of the raters that each member serves, ``[N]``, positive.
+        niche: Niche of each member, ``[N]``.
+
+    Returns:
+        Margins of the K niches that have members, ``[K, M]``.
+    """
     weight = F.one_hot(niche).T.to(margin) * share
+    weight = weight[weight.sum(1) > 0]
     return weight / weight.sum(1, keepdim=True) @ margin
 
 

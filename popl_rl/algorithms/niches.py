@@ -2,9 +2,9 @@
 
 Several searches (see ``popl_rl.algorithms.niche_search``) run side by side, and each rater is held
 out of one. In the first part of a search, members divide the raters among themselves, and lexicase
-selects the parents of new members. In the second, populations of several sizes train on. The raters
-who were held out tell how many niches predict people whom nobody has learnt of best, of all numbers
-(see ``popl_rl.algorithms.divisions``), and the smallest that is hardly worse is taken. At last,
+selects the parents of new members. In the second, populations of several sizes train on. What most
+searches agree upon (see ``popl_rl.algorithms.agreement``) is judged by the raters who were held
+out: the number of niches is taken that predicts people whom nobody has learnt of best. At last,
 fresh members are trained by the whole recipe on the division of the raters that was found: what was
 learnt while it was wrong would stay otherwise.
 """
@@ -15,16 +15,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from popl_rl.algorithms.divisions import Division, prediction, responsibility
+from popl_rl.algorithms.agreement import agreements
+from popl_rl.algorithms.divisions import responsibility
 from popl_rl.algorithms.needed import behind_best, standard_error, sufficient
 from popl_rl.algorithms.niche_search import NicheSearch, descend_served
 from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.stacked_adam import StackedAdam
 from popl_rl.config import NicheSettings, POPLSettings
-from popl_rl.models.calibration import fit_response
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.population import Population
-from popl_rl.models.preference_likelihood import MISTAKE
 from popl_rl.models.schedules import decay
 from popl_rl.models.scoring import rater_accuracy
 
@@ -46,7 +45,7 @@ class NichePOPL:
     Attributes:
         generation: Generations done so far.
         generations: Generations after which it is finished: of the searches, and the problem's.
-        sizes: What was compared, ``(members, mean log-likelihood of held-out raters' answers,
+        sizes: What was compared, ``(niches, mean log-likelihood of held-out raters' answers,
             standard error of how far that is behind the best, paired over raters)``; empty before.
         scale: How much the members' scores are to be believed when they are catered, by raters whom
             a search had not learnt of; 1 before.
@@ -162,40 +161,29 @@ class NichePOPL:
         return descend_served(problem, found.stack, found.training, found.served, self.generator)
 
     def _settle(self) -> None:
-        """Choose a size by the raters held out, and start anew from the division it has found."""
+        """Choose the number of niches by raters held out, and start anew from who is in which."""
         for search in self.searches:
             if not search.sizes:
                 search.divide()
+        judged = [search.judged for search in self.searches]
         divided = [search.divisions() for search in self.searches]
-        most = min(map(len, divided))
-        # Every rater is held out of one search, and its value is 0 in all the others.
-        value = torch.stack(
-            [torch.stack([one.value for one in found[:most]]) for found in divided]
-        ).sum(0)
-        behind = behind_best(value)
-        chosen = sufficient(behind, evidence=self.settings.evidence)
-        mean, error = value.mean(1).tolist(), standard_error(behind).tolist()
-        self.sizes = list(zip(range(1, most + 1), mean, error, strict=True))
+        agreed = agreements(self.problem, judged, divided)
+        behind = behind_best(torch.stack([one.value for one in agreed]))
+        best = agreed[sufficient(behind, evidence=self.settings.evidence)]
+        mean = [float(one.value.mean()) for one in agreed]
+        error = standard_error(behind).tolist()
+        number = [one.number for one in agreed]
+        self.sizes = list(zip(number, mean, error, strict=True))
         # Where some members serve nobody, there was room for more.
-        if chosen == most - 1 and most == min(search.sizes[-1] for search in self.searches):
+        most = min(map(len, divided))
+        if best.found == most == min(search.sizes[-1] for search in self.searches):
             warnings.warn(
                 f"the largest number of members compared, {most}, predicts raters best, so "
                 "there may be more groups than members; raise method.members",
                 stacklevel=2,
             )
-        search, best = max(
-            zip(self.searches, (found[chosen] for found in divided), strict=True),
-            key=lambda pair: self._predicts(pair[1]),
-        )
-        judged = search.judged
-        self.scale = fit_response(best.margins(judged), judged.comparisons, mistake=MISTAKE)[0]
-        served = best.served(self.problem)
-        self.found = _Niches(self.problem, served, generator=self.generator)
-
-    def _predicts(self, division: Division) -> float:
-        """How well a division predicts all raters, most of whom it has learnt of."""
-        margin = division.margins(self.problem)
-        return float(prediction(margin, self.problem.comparisons).mean())
+        self.scale = best.scale(judged)
+        self.found = _Niches(self.problem, best.served(self.problem), generator=self.generator)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the next generation depends on."""

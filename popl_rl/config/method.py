@@ -98,7 +98,7 @@ class NicheSettings:
     specialists: int = 256  # raters, at most, for each of whom a specialist may be a founder
     selections: int = 6  # times in a search that unneeded members make room for children
     settled: float = 0.55  # generations of the searches, in those that the fresh members have
-    evidence: float = 0.5  # standard errors by which a smaller set may predict raters worse
+    evidence: float = 0.0  # standard errors by which fewer niches may predict raters worse
 
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
