@@ -141,6 +141,29 @@ def solve(
     )
 
 
+def expected_visits(table: Table, probabilities: Tensor, *, horizon: int) -> Tensor:
+    """How often a policy takes each step in an episode, exactly, see ``policy_return``.
+
+    Args:
+        table: The transitions.
+        probabilities: ``[S, A]``, the policy: each row sums to one.
+        horizon: Number of steps after which an episode is cut off.
+
+    Returns:
+        ``[S, A]`` float64. Its product with any reward of steps is the policy's return.
+    """
+    policy = probabilities.double()
+    policy = policy / policy.sum(1, keepdim=True)
+    alive = table.start.double() / table.start.double().sum()
+    visits = torch.zeros_like(policy)
+    for _ in range(horizon):
+        flow = alive.unsqueeze(1) * policy
+        visits += flow
+        flow = flow.masked_fill(table.terminal, 0.0)
+        alive = torch.zeros_like(alive).index_add_(0, table.next_state.flatten(), flow.flatten())
+    return visits
+
+
 def policy_return(table: Table, probabilities: Tensor, reward: Tensor, *, horizon: int) -> float:
     """Return a policy's expected undiscounted return over an episode, exactly.
 

@@ -12,9 +12,12 @@ its steps; ``accuracy@K`` and ``recovery@K`` after K answers.
 Of a set as a whole, ``best_return`` and ``best_recovery`` of the best of the members rolled out,
 without the luck of the best, and ``accurate_return`` and ``accurate_recovery`` of the member that
 ranks the group's held-out pairs best. Where the environment has a transition table, each of these
-recoveries has a ``share_of_optimum`` beside it, from exact returns instead of rollouts.
+recoveries has a ``share_of_optimum`` beside it, from exact returns instead of rollouts (and one of
+always taking the most likely action, ``greedy_share_of_optimum``); so has choice from menus.
 
-For the group ``all``: ``worst_recovery, worst_share_of_optimum`` and ``coverage`` of the groups.
+For the group ``all``: ``worst_recovery, worst_share_of_optimum`` and ``coverage`` of the groups,
+and ``rater_quantile_share_of_optimum`` and ``rater_quantile_accuracy``, the 10 % quantiles over
+raters in the groups' shares.
 For a set also the number of ``distinct`` and ``effective`` members; how well it meets held-out
 raters whose groups nobody looks at, see ``popl_rl.evaluation.held_out_raters`` and
 ``popl_rl.evaluation.unexplained_raters``; and of the fair choice of one panel of held-out raters,
@@ -45,9 +48,13 @@ from popl_rl.evaluation.measures import (
     held_out_pairs,
     new_rater_answers,
 )
-from popl_rl.evaluation.optimum import ExactReturns
+from popl_rl.evaluation.optimum import ExactReturns, known_scale
 from popl_rl.evaluation.protocol import EvaluationProtocol, MeasuredInfos
-from popl_rl.evaluation.references import score_distributional, score_references
+from popl_rl.evaluation.references import (
+    score_baselines,
+    score_distributional,
+    score_references,
+)
 from popl_rl.evaluation.results import Performance, Rows, Scoreboard, Served
 from popl_rl.evaluation.unexplained_raters import look_for_unexplained
 from popl_rl.keys import RATER
@@ -106,12 +113,8 @@ class Evaluator:
             )
             for index in range(len(groups))
         }
-        self._exact: ExactReturns | None = None
+        self._exact = known_scale(acting, groups)
         self._policies = acting.policies if isinstance(acting, Rolling) else None
-        if isinstance(acting, Rolling) and acting.world.table is not None:
-            self._exact = ExactReturns(
-                acting.world.table, groups, horizon=acting.max_steps, greedy=acting.greedy
-            )
 
     def scores(self, hypotheses: HypothesisSet) -> Tensor:
         """Score of every segment in every hypothesis's eyes, ``[P, N]``."""
@@ -232,7 +235,8 @@ class Evaluator:
             brex = self._serve(reward_baselines.brex, "brex", rows, curve=[])
             self._score_as_a_whole(reward_baselines.brex, "brex", rows, brex, pooled_scores)
         if baselines is not None and base is not None:
-            episodes |= self._score_baselines(baselines, base, rows)
+            pooled = "pooled_cpl" if isinstance(baselines, PolicySet) else "bradley_terry"
+            episodes |= score_baselines(rows, base, self.accuracy(baselines), pooled=pooled)
         if reward_baselines is not None:
             score_distributional(rows, reward_baselines, self.acting, self.bank, self.pairs)
         for index in range(len(self.groups)):
@@ -245,11 +249,15 @@ class Evaluator:
         return Scoreboard(rows.table(), catered, episodes, label)
 
     def _perform(self, hypotheses: HypothesisSet | None) -> Performance:
-        """Episodes of every hypothesis, and exact returns where every transition is known."""
-        exact = None
-        if self._exact is not None and self._policies is not None:
-            exact = self._exact(self._policies(hypotheses))
-        return Performance(self.acting(hypotheses), exact)
+        """Episodes of every hypothesis, and exact returns where the optimum is known."""
+        episodes = self.acting(hypotheses)
+        if isinstance(self._exact, ExactReturns) and self._policies is not None:
+            policies = self._policies(hypotheses)
+            return Performance(episodes, self._exact(policies), self._exact.of_greedy(policies))
+        known = self._exact is not None  # of choosing from menus, all of which are in the episodes
+        return Performance(
+            episodes, group_returns(episodes, self.groups).double() if known else None
+        )
 
     def _rows(
         self, random: Performance, cloned: Performance | None, base: Performance | None
@@ -265,7 +273,14 @@ class Evaluator:
         else:
             floor = group_returns(random.episodes, self.groups)[0]
         oracle = torch.full_like(floor, torch.nan) if returns is None else returns.diagonal()
-        return Rows(self.groups, self.infos, floor=floor, oracle=oracle, exact=self._exact)
+        return Rows(
+            self.groups,
+            self.infos,
+            floor=floor,
+            oracle=oracle,
+            exact=self._exact,
+            shares=self.shares,
+        )
 
     def _serve(
         self, found: HypothesisSet, label: str, rows: Rows, *, curve: Sequence[int]
@@ -292,7 +307,7 @@ class Evaluator:
                 entry = label, method
                 share = served.share(index, chosen)
                 rows.add(entry, index, done, share, raters=chosen.shape[1])
-                given = float(accuracy[chosen[index], index].mean())
+                given = accuracy[chosen[index], index]
                 rows.add_accuracy(entry, index, catered=given, best=most)
         score_hindsight(rows, label, done, [members.index(int(one)) for one in accurate])
         score_curves(rows, label, served, points, accuracy)
@@ -379,17 +394,3 @@ class Evaluator:
         )
         for measure, value in (values | lost.measures()).items():
             rows.add_whole((label, ""), measure, value)
-
-    def _score_baselines(
-        self, baselines: HypothesisSet, base: Performance, rows: Rows
-    ) -> dict[tuple[str, str], TensorDict]:
-        """Rows of the pooled hypothesis and of each group's oracle; returns their episodes."""
-        accuracy, one, episodes = self.accuracy(baselines), torch.ones(1), {}
-        pooled = "pooled_cpl" if isinstance(baselines, PolicySet) else "bradley_terry"
-        for index, group in enumerate(self.groups):
-            for name, row in ((pooled, 0), ("oracle", 1 + index)):
-                rows.add((name, ""), index, base.one(row), one)
-                value = float(accuracy[row, index])
-                rows.add_accuracy((name, ""), index, catered=value, best=value)
-                episodes[name, group.name] = base.one(row).episodes
-        return episodes

@@ -1,4 +1,4 @@
-"""Exact returns and the share of the optimum, where every transition is known."""
+"""Exact returns and the share of the optimum, where every transition, or every item, is known."""
 
 from collections.abc import Sequence
 
@@ -6,13 +6,21 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 from torch import Tensor
 
-from popl_rl.data.tables import Table, policy_return
+from popl_rl.data.tables import Table, expected_visits, policy_return
+from popl_rl.evaluation.acting import Acting, Choosing, Rolling
 from popl_rl.evaluation.measures import recovery
 from popl_rl.keys import OBSERVATION
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.raters.groups import RaterGroup
 
-__all__ = ["ExactReturns", "action_probabilities", "optimal_return"]
+__all__ = [
+    "ExactReturns",
+    "Scale",
+    "action_probabilities",
+    "known_scale",
+    "menu_scale",
+    "optimal_return",
+]
 
 _TOLERANCE = 1e-9
 
@@ -62,7 +70,41 @@ def optimal_return(table: Table, utility: Tensor, *, horizon: int) -> float:
     return float(start @ value / start.sum())
 
 
-class ExactReturns:
+class Scale:
+    """What random actions and the best policy of each group are worth to it.
+
+    Args:
+        random: Return of uniformly random actions to each group, ``[G]`` float64.
+        optimum: Highest possible return to each group, ``[G]`` float64.
+    """
+
+    def __init__(self, random: Tensor, optimum: Tensor) -> None:
+        self.random, self.optimum = random, optimum
+
+    def share_of_optimum(self, index: int, value: float) -> float:
+        """``(value - random) / (optimum - random)`` of a return to the group of this index.
+
+        NaN where a group likes nothing better than random actions.
+        """
+        low, high = float(self.random[index]), float(self.optimum[index])
+        # The two are sums in different orders, which differ in the last digits where all is alike.
+        if high - low <= _TOLERANCE * max(1.0, abs(high)):
+            return float("nan")
+        return recovery(value, reference=low, oracle=high)
+
+
+def menu_scale(utility: Tensor, menus: Tensor) -> Scale:
+    """The scale of choosing from menus: a random item of each, and the best item of each.
+
+    Args:
+        utility: What each of N items is worth to each group, ``[G, N]``.
+        menus: Items on each of E menus, ``[E, K]``.
+    """
+    offered = utility.double()[:, menus]
+    return Scale(offered.mean((1, 2)), offered.amax(2).mean(1))
+
+
+class ExactReturns(Scale):
     """Expected returns of policies to every group, without rollouts and their noise.
 
     The optimum may act by the number of steps left, so that no policy, whatever it knows, is above
@@ -84,11 +126,8 @@ class ExactReturns:
     ) -> None:
         self.table, self.horizon, self.greedy = table, horizon, greedy
         self.utilities = [group.step_utility(table.steps) for group in groups]
-        self.optimum = torch.tensor(
-            [optimal_return(table, utility, horizon=horizon) for utility in self.utilities],
-            dtype=torch.float64,
-        )
-        self.random = self(None)[0]
+        optimum = [optimal_return(table, utility, horizon=horizon) for utility in self.utilities]
+        super().__init__(self(None)[0], torch.tensor(optimum, dtype=torch.float64))
 
     def __call__(self, policies: PolicySet | Tensor | None) -> Tensor:
         """Exact returns to every group.
@@ -109,13 +148,34 @@ class ExactReturns:
         ]
         return torch.tensor(returns, dtype=torch.float64)
 
-    def share_of_optimum(self, index: int, value: float) -> float:
-        """``(value - random) / (optimum - random)`` of a return to the group of this index.
+    def of_greedy(self, policies: PolicySet | Tensor | None) -> Tensor:
+        """Exact returns of always taking the most likely action, ``[P, G]`` float64.
 
-        NaN where a group likes nothing better than random actions.
+        Args:
+            policies: See ``action_probabilities``; tables and random actions stay as they are.
         """
-        low, high = float(self.random[index]), float(self.optimum[index])
-        # The two are sums in different orders, which differ in the last digits where all is alike.
-        if high - low <= _TOLERANCE * max(1.0, abs(high)):
-            return float("nan")
-        return recovery(value, reference=low, oracle=high)
+        tables = action_probabilities(policies, self.table, greedy=True)
+        visits = torch.stack(
+            [expected_visits(self.table, own, horizon=self.horizon) for own in tables]
+        )
+        return visits.flatten(1) @ torch.stack(self.utilities).double().flatten(1).T
+
+
+def known_scale(acting: Acting, groups: Sequence[RaterGroup]) -> Scale | None:
+    """Tell the best there is where it is known.
+
+    Args:
+        acting: Where hypotheses act.
+        groups: G groups.
+
+    Returns:
+        ``ExactReturns`` where every transition is known, ``menu_scale`` where items are chosen from
+        menus, and None elsewhere.
+    """
+    if isinstance(acting, Choosing):
+        utility = torch.stack([group.step_utility(acting.segments).sum(1) for group in groups])
+        return menu_scale(utility, acting.menus)
+    if isinstance(acting, Rolling) and acting.world.table is not None:
+        table, greedy = acting.world.table, acting.greedy
+        return ExactReturns(table, groups, horizon=acting.max_steps, greedy=greedy)
+    return None

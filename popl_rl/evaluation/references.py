@@ -9,20 +9,21 @@ known.
 from collections.abc import Mapping
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from popl_rl.algorithms.reward_baselines import RewardBaselines
 from popl_rl.data.bank import SegmentBank
 from popl_rl.evaluation.acting import Acting, Choosing, Rolling
 from popl_rl.evaluation.measures import group_accuracy
-from popl_rl.evaluation.optimum import ExactReturns
+from popl_rl.evaluation.optimum import Scale
 from popl_rl.evaluation.results import Performance, Rows
 
-__all__ = ["score_behaviours", "score_distributional", "score_references"]
+__all__ = ["score_baselines", "score_behaviours", "score_distributional", "score_references"]
 
 
 def score_references(
-    rows: Rows, acting: Acting, *, ppo: Performance | None, exact: ExactReturns | None
+    rows: Rows, acting: Acting, *, ppo: Performance | None, exact: Scale | None
 ) -> None:
     """Add what G groups could get besides, without any set of policies.
 
@@ -31,7 +32,7 @@ def score_references(
         acting: Where the data's behaviours act, see ``score_behaviours``.
         ppo: What policies do that PPO has trained on the utility of each group, ``[G, E, H]``; None
             for none.
-        exact: Knows the optimum of each group; None without a transition table.
+        exact: Knows the optimum of each group; None where nobody does.
     """
     score_behaviours(rows, acting)
     if ppo is not None:
@@ -39,6 +40,30 @@ def score_references(
             rows.add(("ppo", ""), index, ppo.one(index), torch.ones(1))
     if exact is not None:
         _score_optimum(rows, exact)
+
+
+def score_baselines(
+    rows: Rows, base: Performance, accuracy: Tensor, *, pooled: str
+) -> dict[tuple[str, str], TensorDict]:
+    """Add the hypothesis that was trained on everybody's answers, and each group's oracle.
+
+    Args:
+        rows: What is added to.
+        base: What the pooled one and, after it, the G oracles do.
+        accuracy: Of each of these on each group's held-out pairs, ``[1 + G, G]``.
+        pooled: Name of the pooled one.
+
+    Returns:
+        Episodes ``[1, E, H]`` behind pictures, by name and group.
+    """
+    one, episodes = torch.ones(1), {}
+    for index, group in enumerate(rows.groups):
+        for name, row in ((pooled, 0), ("oracle", 1 + index)):
+            done, own = base.one(row), accuracy[row : row + 1, index]
+            rows.add((name, ""), index, done, one)
+            rows.add_accuracy((name, ""), index, catered=own, best=float(own))
+            episodes[name, group.name] = done.episodes
+    return episodes
 
 
 def score_behaviours(rows: Rows, acting: Acting) -> None:
@@ -82,16 +107,18 @@ def score_distributional(
     """
     assert isinstance(acting, Choosing)
     for entry, score in rewards.scores(bank).items():
-        chosen = Performance(acting.choose(score.cpu().unsqueeze(0)), None)
-        accuracy = group_accuracy(score.cpu().unsqueeze(0), pairs)[0].tolist()
-        for index, value in enumerate(accuracy):
+        episodes = acting.choose(score.cpu().unsqueeze(0))
+        chosen = Performance(episodes, rows.returns(episodes).double())
+        accuracy = group_accuracy(score.cpu().unsqueeze(0), pairs)
+        for index in range(len(rows.groups)):
             rows.add(entry, index, chosen, torch.ones(1))
-            rows.add_accuracy(entry, index, catered=value, best=value)
+            own = accuracy[:, index]
+            rows.add_accuracy(entry, index, catered=own, best=float(own))
     for kind, model in rewards.dpl.items():
         rows.add_whole((f"dpl_{kind}", ""), "hidden_context", model.hidden_context(bank))
 
 
-def _score_optimum(rows: Rows, exact: ExactReturns) -> None:
+def _score_optimum(rows: Rows, exact: Scale) -> None:
     """Add the return of the best policy of each group."""
     for index, value in enumerate(exact.optimum.tolist()):
         rows.add_return(("optimum", ""), index, value, error=0.0)

@@ -19,13 +19,15 @@ from popl_rl.evaluation.measures import (
     steps_to_success,
     success_rate,
 )
-from popl_rl.evaluation.optimum import ExactReturns
+from popl_rl.evaluation.optimum import Scale
 from popl_rl.evaluation.protocol import MeasuredInfos
 from popl_rl.evaluation.statistics import RESULT_COLUMNS
 from popl_rl.keys import REWARD
 from popl_rl.raters.groups import RaterGroup
 
-__all__ = ["Performance", "Rows", "Scoreboard", "Served"]
+__all__ = ["Performance", "Rows", "Scoreboard", "Served", "weighted_quantile"]
+
+_LEVEL = 0.1  # share of the raters who get less than the quantile over raters
 
 
 @dataclass(frozen=True)
@@ -71,16 +73,19 @@ class Performance:
 
     Attributes:
         episodes: ``[P, E, H]``.
-        exact: Exact return of each to each group, ``[P, G]``; None without a transition table.
+        exact: Exact return of each to each group, ``[P, G]``; None where the optimum is unknown.
+        greedy: The same of always taking the most likely action; None without a transition table.
     """
 
     episodes: TensorDict
     exact: Tensor | None
+    greedy: Tensor | None = None
 
     def one(self, index: int) -> "Performance":
         """The performance of one hypothesis alone."""
         rows = slice(index, index + 1)
-        return Performance(self.episodes[rows], None if self.exact is None else self.exact[rows])
+        returns = [None if own is None else own[rows] for own in (self.exact, self.greedy)]
+        return Performance(self.episodes[rows], *returns)
 
 
 @dataclass(frozen=True)
@@ -113,7 +118,8 @@ class Rows:
         infos: Which infos mean success and doors, and which are measured.
         floor: Return to each group that is a recovery of 0, ``[G]``.
         oracle: Return of each group's oracle, ``[G]``; NaN where it is unknown.
-        exact: Knows the optimum of each group; None without a transition table.
+        exact: Knows the optimum of each group; None where nobody does.
+        shares: Chance that a rater is of each group; equal if None.
     """
 
     def __init__(
@@ -123,11 +129,15 @@ class Rows:
         *,
         floor: Tensor,
         oracle: Tensor,
-        exact: ExactReturns | None = None,
+        exact: Scale | None = None,
+        shares: Sequence[float] | None = None,
     ) -> None:
         self.groups, self.infos = groups, infos
         self.floor, self.oracle, self.exact = floor, oracle, exact
+        self.shares = [1 / len(groups)] * len(groups) if shares is None else shares
         self.rows: list[tuple[str, str, str, str, float]] = []
+        # What each rater is given: values and weights by measure and entry.
+        self._each: dict[tuple[str, tuple[str, str]], list[tuple[Tensor, Tensor]]] = {}
 
     def returns(self, episodes: TensorDict) -> Tensor:
         """Mean return of P hypotheses to every group, ``[P, G]``; see ``group_returns``."""
@@ -160,8 +170,13 @@ class Rows:
             self.add_value(entry, index, "reward", float(reward @ share))
             length = rolled[MASK].sum(-1).float().mean(-1)
             self.add_value(entry, index, "length", float(length @ share))
-        if done.exact is not None:
-            self.add_share(entry, index, float(done.exact[:, index] @ share.double()))
+        for prefix, exact in (("", done.exact), ("greedy_", done.greedy)):
+            if exact is not None:
+                own = exact[:, index]
+                self.add_share(entry, index, float(own @ share.double()), prefix=prefix)
+                of_each = [self._share_of_optimum(index, value) for value in own.tolist()]
+                measure = f"{prefix}share_of_optimum"
+                self._keep(measure, entry, index, torch.tensor(of_each), share)
         success = float(success_rate(rolled, self.infos.success) @ share)
         self.add_value(entry, index, "success", success)
         if self.infos.measured:
@@ -205,17 +220,35 @@ class Rows:
         suffix: str = "",
     ) -> None:
         """The share of the optimum that an exact return to one group is."""
-        if self.exact is None:
-            raise ValueError("exact must be given to tell shares of the optimum, got None")
-        share = self.exact.share_of_optimum(index, value)
+        share = self._share_of_optimum(index, value)
         self.add_value(entry, index, f"{prefix}share_of_optimum{suffix}", share)
 
+    def _share_of_optimum(self, index: int, value: float) -> float:
+        if self.exact is None:
+            raise ValueError("exact must be given to tell shares of the optimum, got None")
+        return self.exact.share_of_optimum(index, value)
+
     def add_accuracy(
-        self, entry: tuple[str, str], index: int, *, catered: float, best: float
+        self, entry: tuple[str, str], index: int, *, catered: Tensor, best: float
     ) -> None:
-        """How well a method ranks for one group: what is given, and the best of its set."""
-        self.add_value(entry, index, "accuracy", catered)
+        """How well a method ranks for one group: what is given, and the best of its set.
+
+        Args:
+            entry: Method and choice.
+            index: Index of the group.
+            catered: Accuracy of what each of R raters of the group is given, ``[R]``.
+            best: Accuracy of the best of the set.
+        """
+        self.add_value(entry, index, "accuracy", float(catered.mean()))
         self.add_value(entry, index, "best_accuracy", best)
+        self._keep("accuracy", entry, index, catered, torch.ones(len(catered)) / len(catered))
+
+    def _keep(
+        self, measure: str, entry: tuple[str, str], index: int, values: Tensor, weights: Tensor
+    ) -> None:
+        """Remember what single raters of a group are given, weights of whom sum to 1."""
+        kept = values.double(), weights.double() * self.shares[index]
+        self._each.setdefault((measure, entry), []).append(kept)
 
     def add_value(self, entry: tuple[str, str], index: int, measure: str, value: float) -> None:
         """Any number about a method, a choice and a group."""
@@ -226,19 +259,46 @@ class Rows:
         self.rows.append((*entry, "all", measure, value))
 
     def add_worst(self) -> None:
-        """What each method's recoveries, and shares of the optimum, of all groups come to."""
+        """What each method's recoveries, and shares of the optimum, of all groups come to.
+
+        Beside the worst group also the 10 % quantile over raters, each group's in its share.
+        """
         found: dict[tuple[str, tuple[str, str]], list[float]] = {}
         for method, choice, _, measure, value in self.rows:
-            if measure in ("recovery", "share_of_optimum"):
+            if measure in ("recovery", "share_of_optimum", "greedy_share_of_optimum"):
                 found.setdefault((measure, (method, choice)), []).append(value)
-        for (measure, entry), values in found.items():
-            self.add_whole(entry, f"worst_{measure}", lowest(values))
+        for (measure, entry), of_groups in found.items():
+            self.add_whole(entry, f"worst_{measure}", lowest(of_groups))
             if measure == "recovery":
-                self.add_whole(entry, "coverage", coverage(values))
+                self.add_whole(entry, "coverage", coverage(of_groups))
+        for (measure, entry), kept in self._each.items():
+            values, weights = (torch.cat(part) for part in zip(*kept, strict=True))
+            quantile = weighted_quantile(values, weights, level=_LEVEL)
+            self.add_whole(entry, f"rater_quantile_{measure}", quantile)
 
     def table(self) -> pd.DataFrame:
         """The rows so far, as a table."""
         return pd.DataFrame(self.rows, columns=RESULT_COLUMNS)
+
+
+def weighted_quantile(values: Tensor, weights: Tensor, *, level: float) -> float:
+    """Lowest value such that this one and those below have at least a share of all weight.
+
+    Args:
+        values: ``[R]``.
+        weights: How much each counts, ``[R]``, not negative; those of weight 0 do not count.
+        level: The share, in (0, 1].
+
+    Returns:
+        One of the values; NaN if one that counts is unknown.
+    """
+    counts = weights > 0
+    ordered, order = values[counts].sort()
+    if bool(ordered.isnan().any()):
+        return float("nan")
+    below = weights[counts][order].cumsum(0)
+    # Sums of weights such as ten times 0.1 fall short of their whole in the last digits.
+    return float(ordered[below >= level * below[-1] - 1e-9][0])
 
 
 def _error(returns: Tensor, share: Tensor, raters: int | None) -> float:

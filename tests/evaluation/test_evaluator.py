@@ -132,6 +132,20 @@ def test_without_baselines_there_is_no_recovery(evaluator, policies):
         assert math.isfinite(board.value(method, "likes_left", "return"))
 
 
+def test_greedy_acting_and_single_raters_beside_the_groups(evaluator, baselines):
+    """A policy that leans to one side is the optimum when it acts greedily, not when sampled."""
+    board = evaluator.score(walkers(1.0, -1.0), baselines)
+    for group in ("likes_left", "likes_right"):
+        assert board.value("popl", group, "greedy_share_of_optimum") == pytest.approx(1)
+        assert board.value("popl", group, "share_of_optimum") < 0.9
+    assert board.value("popl", "all", "worst_greedy_share_of_optimum") == pytest.approx(1)
+    # Everybody is given the policy that leans to their side, so the quantile is the worst group's.
+    worst = board.value("popl", "all", "worst_share_of_optimum")
+    given = board.value("popl", "all", "rater_quantile_share_of_optimum")
+    assert given == pytest.approx(worst)
+    assert board.value("random", "all", "rater_quantile_share_of_optimum") == pytest.approx(0)
+
+
 def test_judging_is_reproducible(evaluator, policies, baselines):
     one, other = (evaluator.score(policies, baselines).results for _ in range(2))
     assert one.equals(other)

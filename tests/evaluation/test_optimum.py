@@ -8,7 +8,12 @@ from torch import nn
 
 from popl_rl.data.environments import make_world
 from popl_rl.evaluation.measures import group_returns, roll_out
-from popl_rl.evaluation.optimum import ExactReturns, action_probabilities, optimal_return
+from popl_rl.evaluation.optimum import (
+    ExactReturns,
+    action_probabilities,
+    menu_scale,
+    optimal_return,
+)
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.population import Population
@@ -113,3 +118,25 @@ def test_nothing_acts_after_a_terminal_step(world):
     # Left at once is 1; right, left is 0.4 only; three times right is 1.2; two and left the 0.4s.
     assert optimal_return(ends, utility, horizon=1) == pytest.approx(1.0)
     assert optimal_return(ends, utility, horizon=3) == pytest.approx(1.4)
+
+
+def test_greedy_returns_are_those_of_the_likeliest_actions(world, groups, exact):
+    """However a policy is rated, sampled or not, its greedy returns are the same."""
+    policies = walkers(1.0, -0.1)
+    rated_greedily = ExactReturns(world.table, groups, horizon=HORIZON, greedy=True)
+    for one in (exact, rated_greedily):
+        assert one.of_greedy(policies).tolist() == [
+            pytest.approx([0.5, 2.5]),
+            pytest.approx([2.5, 0.5]),
+        ]
+    assert exact(policies)[0, 1] < 2.4
+    assert exact.of_greedy(None).tolist() == [pytest.approx(exact.random.tolist())]
+
+
+def test_the_scale_of_menus_by_hand():
+    """Two menus of items worth 0, 1 and 2, 4 to one group; the other likes all alike."""
+    scale = menu_scale(torch.tensor([[0.0, 1, 2, 4], [1, 1, 1, 1]]), torch.tensor([[0, 1], [2, 3]]))
+    assert scale.random.tolist() == [1.75, 1.0]
+    assert scale.optimum.tolist() == [2.5, 1.0]
+    assert scale.share_of_optimum(0, 2.5) == 1
+    assert math.isnan(scale.share_of_optimum(1, 1.0))
