@@ -115,6 +115,7 @@ CASES = [
     ("method__popl__selection", "",
      "method.popl.selection must be lexicase or a reference, got ''"),
     ("method__vpl__kl", -0.5, "method.vpl.kl must be at least 0, got -0.5"),
+    ("method__training__bc", -1.0, "method.training.bc must be at least 0, got -1.0"),
     ("method__training__slip", 0.5, "method.training.slip must be in [0, 0.5), got 0.5"),
     ("method__refinement__folds", 1, "method.refinement.folds must be at least 2, got 1"),
     ("method__mixture__held_out", 1.0, "method.mixture.held_out must be in [0, 1), got 1.0"),

@@ -15,7 +15,12 @@ __all__ = ["CPLLoss", "cpl_loss", "descend"]
 
 
 def cpl_loss(
-    preferred: Tensor, other: Tensor, *, conservatism: float = 1.0, slip: float = 0.0
+    preferred: Tensor,
+    other: Tensor,
+    *,
+    conservatism: float = 1.0,
+    slip: float = 0.0,
+    cloning: float = 0.0,
 ) -> Tensor:
     """CPL loss of scored pairs, ``-log sigmoid(S(sigma+) - lambda S(sigma-))``.
 
@@ -29,11 +34,13 @@ def cpl_loss(
         conservatism: Lambda in (0, 1].
         slip: Chance that an answer is a slip, in [0, 0.5), see
             ``popl_rl.models.preference_likelihood.log_likelihood``.
+        cloning: Weight of behaviour cloning, of minus the mean score of both segments.
 
     Returns:
         Losses, same shape.
     """
-    return -log_likelihood(preferred - conservatism * other, slip)
+    loss = -log_likelihood(preferred - conservatism * other, slip)
+    return loss - cloning * (preferred + other) / 2 if cloning else loss
 
 
 class CPLLoss(LossModule):
@@ -50,10 +57,12 @@ class CPLLoss(LossModule):
         conservatism: Lambda in (0, 1].
         discount: Per-step discount gamma.
         slip: Chance that an answer is a slip.
+        bc: Weight of behaviour cloning, of minus the mean log-likelihood of a step of both
+            segments of a pair (of segments without padding and discount).
 
     Raises:
-        ValueError: If ``alpha`` is not positive or ``conservatism`` or ``discount`` is outside
-            (0, 1].
+        ValueError: If ``alpha`` is not positive, ``bc`` is negative, or ``conservatism`` or
+            ``discount`` is outside (0, 1].
 
     Example:
         >>> loss = CPLLoss(population, bank, alpha=0.5)  # doctest: +SKIP
@@ -74,6 +83,7 @@ class CPLLoss(LossModule):
         conservatism: float = 0.9,
         discount: float = 1.0,
         slip: float = 0.0,
+        bc: float = 0.0,
     ) -> None:
         super().__init__()
         if not alpha > 0:
@@ -82,12 +92,15 @@ class CPLLoss(LossModule):
             raise ValueError(f"conservatism must be in (0, 1], got {conservatism}")
         if not 0 < discount <= 1:
             raise ValueError(f"discount must be in (0, 1], got {discount}")
+        if not bc >= 0:
+            raise ValueError(f"bc must be at least 0, got {bc}")
         self.population = population
         self.bank = bank
         self.alpha = alpha
         self.conservatism = conservatism
         self.discount = discount
         self.slip = slip
+        self.bc = bc
         self._features: Tensor | None = None
         self._cells = bank.row
 
@@ -138,8 +151,20 @@ class CPLLoss(LossModule):
         output = output.gather(1, cell.unsqueeze(-1).expand(-1, -1, choices))
         return spec.step_scores(output, bank.action[segment].flatten(-3, -2))
 
-    def _loss(self, preferred: Tensor, other: Tensor) -> Tensor:
-        return cpl_loss(preferred, other, conservatism=self.conservatism, slip=self.slip)
+    @property
+    def cloning(self) -> float:
+        """``bc`` as a weight of scores, which are ``alpha`` times the sum over the steps."""
+        return self.bc / (self.alpha * self.bank.row.shape[1])
+
+    def losses(self, preferred: Tensor, other: Tensor) -> Tensor:
+        """Losses of scored pairs, any shape."""
+        return cpl_loss(
+            preferred,
+            other,
+            conservatism=self.conservatism,
+            slip=self.slip,
+            cloning=self.cloning,
+        )
 
     def pairs(self, preferred: Tensor, other: Tensor) -> Tensor:
         """Losses of every member on one batch that all share.
@@ -151,7 +176,7 @@ class CPLLoss(LossModule):
         Returns:
             ``[N, B]``.
         """
-        return self._loss(*self.scores(torch.cat([preferred, other])).chunk(2, dim=1))
+        return self.losses(*self.scores(torch.cat([preferred, other])).chunk(2, dim=1))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of one batch per member.
@@ -165,7 +190,7 @@ class CPLLoss(LossModule):
         """
         segment = torch.cat([tensordict["preferred"], tensordict["other"]], 1)
         preferred, other = self.scores(segment).chunk(2, dim=1)
-        loss = self._loss(preferred, other).mean(1).sum()
+        loss = self.losses(preferred, other).mean(1).sum()
         accuracy = (preferred > other).float().mean(1).detach()
         return TensorDict({"loss_cpl": loss, "accuracy": accuracy}, [])
 

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from popl_rl.algorithms.draws import by_comparison
 from popl_rl.algorithms.expectation import Expectation, expect
-from popl_rl.algorithms.losses import CPLLoss, cpl_loss, descend
+from popl_rl.algorithms.losses import CPLLoss, descend
 from popl_rl.algorithms.needed import behind_best
 from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.variation import inherit_moments
@@ -268,7 +268,7 @@ class MixturePOPL:
         output = loss.population(self.problem.bank.observation)
         table = loss.alpha * self.problem.spec.table(output).flatten(1)
         better, worse = table @ self._counts[preferred].T, table @ self._counts[other].T
-        return cpl_loss(better, worse, conservatism=loss.conservatism, slip=loss.slip)
+        return loss.losses(better, worse)
 
     def _draw(self, count: int) -> Tensor:
         shape, device = (self.settings.final_batch_size,), self.generator.device

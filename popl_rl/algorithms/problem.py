@@ -89,6 +89,7 @@ class Problem:
             conservatism=self.conservatism,
             discount=self.training.discount,
             slip=self.training.slip,
+            bc=self.spec.cloning(self.training.bc),
         )
 
     def scores(self, population: Population) -> Tensor:

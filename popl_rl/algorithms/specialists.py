@@ -64,6 +64,7 @@ def specialists(
         conservatism=loss.conservatism,
         discount=loss.discount,
         slip=loss.slip,
+        bc=loss.bc,
     )
     personalise(
         own,

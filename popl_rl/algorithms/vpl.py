@@ -152,8 +152,13 @@ class VPL:
         z = mean + log_std.exp() * noise
         better, worse = self.scores(preferred, z), self.scores(other, z)
         recipe = self.problem.training
-        lam = self.problem.conservatism
-        loss = cpl_loss(better, worse, conservatism=lam, slip=recipe.slip).mean()
+        loss = cpl_loss(
+            better,
+            worse,
+            conservatism=self.problem.conservatism,
+            slip=recipe.slip,
+            cloning=self.spec.cloning(recipe.bc) / (recipe.alpha * self.problem.bank.row.shape[1]),
+        ).mean()
         return loss, divergence(mean, log_std).mean()
 
     def scores(self, segment: Tensor, z: Tensor) -> Tensor:

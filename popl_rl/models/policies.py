@@ -60,6 +60,10 @@ class Spec(Protocol):
         """Lambda of the CPL loss for this kind of hypotheses, where the recipe says ``value``."""
         ...
 
+    def cloning(self, value: float) -> float:
+        """Weight of behaviour cloning for this kind of hypotheses, where the recipe says so."""
+        ...
+
     def bank(self, segments: TensorDictBase) -> SegmentBank:
         """Segments ``[N, T]`` as hypotheses of this kind read them."""
         ...
@@ -182,6 +186,10 @@ class PolicySpec:
 
     def conservatism(self, value: float) -> float:
         """As the recipe says: it keeps policies near the data."""
+        return value
+
+    def cloning(self, value: float) -> float:
+        """As the recipe says."""
         return value
 
     def bank(self, segments: TensorDictBase) -> SegmentBank:

@@ -93,6 +93,10 @@ class RewardSpec:
         """Always 1: of reward functions only differences mean something."""
         return 1.0
 
+    def cloning(self, value: float) -> float:  # noqa: ARG002
+        """Always 0: a reward is no likelihood of what was done."""
+        return 0.0
+
     def bank(self, segments: TensorDictBase) -> SegmentBank:
         """See ``reward_bank``."""
         return reward_bank(segments)

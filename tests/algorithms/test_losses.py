@@ -66,6 +66,16 @@ def test_loss_by_hand(hand, alpha, conservatism, discount, expected):
     assert out["accuracy"].tolist() == [1.0]
 
 
+def test_cloning_by_hand(hand):
+    """A step of both segments has the mean log-likelihood (ln(3/8) + ln(1/8)) / 4, at any alpha."""
+    mean = (math.log(3 / 8) + math.log(1 / 8)) / 4
+    for alpha in (1.0, 0.5):
+        with_bc, without = CPLLoss(*hand, alpha=alpha, bc=3.0), CPLLoss(*hand, alpha=alpha)
+        batch = batch_of([[0]], [[1]])
+        added = with_bc(batch)["loss_cpl"] - without(batch)["loss_cpl"]
+        assert float(added.detach()) == pytest.approx(-3.0 * mean, rel=1e-5)
+
+
 def test_scores_by_hand(hand):
     """alpha = 1/2 and gamma = 1: ln(3/8) / 2 and ln(1/8) / 2."""
     scores = CPLLoss(*hand, alpha=0.5).scores(torch.tensor([[0, 1, 0]]))
@@ -189,6 +199,7 @@ def test_members_learn_independently(generator, evolve, discrete):
         ({"conservatism": 0.0}, r"conservatism must be in \(0, 1\], got 0.0"),
         ({"conservatism": 1.1}, r"conservatism must be in \(0, 1\], got 1.1"),
         ({"discount": 0.0}, r"discount must be in \(0, 1\], got 0.0"),
+        ({"bc": -0.1}, "bc must be at least 0, got -0.1"),
         ({"discount": 1.5}, r"discount must be in \(0, 1\], got 1.5"),
     ],
 )

@@ -25,13 +25,14 @@ def built(learner, learning, **method):
 
 
 def test_gradient_popl_is_built_and_warmed_up(learner, learning):
-    recipe = {"alpha": 0.2, "conservatism": 0.7, "discount": 0.9, "slip": 0.1}
+    recipe = {"alpha": 0.2, "conservatism": 0.7, "discount": 0.9, "slip": 0.1, "bc": 2.0}
     recipe = {f"training__{name}": value for name, value in recipe.items()}
     method = {"popl__variation": "gradient", "popl__rater_similarity": False, **recipe}
     popl = built(learner, learning, **method)
     assert isinstance(popl.variation, GradientCPL)
     loss = popl.variation.loss
     assert (popl.epsilon, popl.generation, popl.generations) == ("mad", 0, 4)
+    assert loss.bc == 2.0
     assert (loss.alpha, loss.conservatism, loss.discount, loss.slip) == (0.2, 0.7, 0.9, 0.1)
     assert len(popl.population) == 3
     assert popl.population.evolve == "all"
