@@ -65,6 +65,7 @@ def test_beside_what_they_are_compared_with(result):
         "popl",
         "bradley_terry",
         "oracle",
+        "optimum",
         "brex",
         "dpl_mean_variance",
         "dpl_categorical",
