@@ -43,6 +43,7 @@ from popl_rl.evaluation.chosen_questions import ask_new_raters
 from popl_rl.evaluation.held_out_raters import draw_held_out_raters, favourites, gain
 from popl_rl.evaluation.hindsight import score_hindsight
 from popl_rl.evaluation.measures import (
+    episode_returns,
     group_accuracy,
     group_returns,
     held_out_pairs,
@@ -255,9 +256,8 @@ class Evaluator:
             policies = self._policies(hypotheses)
             return Performance(episodes, self._exact(policies), self._exact.of_greedy(policies))
         known = self._exact is not None  # of choosing from menus, all of which are in the episodes
-        return Performance(
-            episodes, group_returns(episodes, self.groups).double() if known else None
-        )
+        own = episode_returns(episodes, self.groups).double().mean(1) if known else None
+        return Performance(episodes, own)
 
     def _rows(
         self, random: Performance, cloned: Performance | None, base: Performance | None

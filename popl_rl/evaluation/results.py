@@ -176,7 +176,7 @@ class Rows:
                 self.add_share(entry, index, float(own @ share.double()), prefix=prefix)
                 of_each = [self._share_of_optimum(index, value) for value in own.tolist()]
                 measure = f"{prefix}share_of_optimum"
-                self._keep(measure, entry, index, torch.tensor(of_each), share)
+                self._keep(measure, entry, index, torch.tensor(of_each, dtype=torch.float64), share)
         success = float(success_rate(rolled, self.infos.success) @ share)
         self.add_value(entry, index, "success", success)
         if self.infos.measured:

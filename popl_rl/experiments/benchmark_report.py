@@ -32,8 +32,8 @@ _FEW = 4  # methods whose bars can be read, and groups with rows of their own on
 _ACCURACY = "Accuracy in percent: of what new raters are given (of the best member)."
 _WORDS = {
     "share of optimum": "(return − random) / (optimum − random) of the policy that a new rater is "
-    "given, of exact returns, where the environment lists its transitions: 1 is the best that the "
-    "group can get at all, 0 as bad as random actions.",
+    "given, of exact returns, where the environment lists its transitions or items are chosen: 1 "
+    "is the best that the group can get at all, 0 as bad as random actions.",
     "recovery": "(return − floor) / (oracle's return − floor) of the policy that a new rater is "
     "given: 1 is as good as a policy trained with the true groups, 0 as bad as random actions, or "
     "as what `evaluation.reference` names in their place.",

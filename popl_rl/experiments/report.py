@@ -42,8 +42,8 @@ _WORDS = {
     "few answers.",
     "oracle": "trained on the answers of this group alone, so it knows what POPL has to find out.",
     "share of optimum": "(return − random) / (optimum − random), of exact returns, where the "
-    "environment lists its transitions: 1 is the best that the group can get at all, 0 as bad as "
-    "random actions.",
+    "environment lists its transitions or items are chosen: 1 is the best that the group can get "
+    "at all, 0 as bad as random actions.",
     "return": "sum over an episode of what the group's raters value, averaged over episodes.",
     "recovery": "(return − floor) / (oracle's return − floor): 1 is as good as the oracle, 0 as "
     "bad as random actions, or as what `evaluation.reference` names in their place.",
