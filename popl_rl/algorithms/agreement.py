@@ -97,25 +97,21 @@ def _agreement(
 ) -> Agreement | None:
     """Join niches of all searches into as many as each has; None if one shares nothing at all."""
     count = [int(division.niche.max()) + 1 for division in divisions]
-    search = torch.arange(len(count)).repeat_interleave(torch.tensor(count))
     chance = torch.cat([division.margins(problem).sigmoid() for division in divisions])
     share = torch.cat([_served(division) for division in divisions])
-    joined = next(niche for niche in merge(chance, share) if int(niche.max()) + 1 == count[0])
-    by = F.one_hot(joined).T @ F.one_hot(search).to(joined.device)
-    common = (by > 0).sum(1) > len(divisions) / 2
-    if not common.any():
-        return None
+    joined = merge(chance, share)[-count[0]].split(count)
+    there = torch.stack([F.one_hot(own, count[0]).amax(0) for own in joined])
+    common = there.sum(0) > len(divisions) / 2
     number = torch.where(common, common.cumsum(0) - 1, -1)
-    parts = []
-    value = torch.zeros_like(divisions[0].value)
-    for index, (division, others) in enumerate(zip(divisions, judged, strict=True)):
-        niche = number[joined[(search == index).to(joined.device)][division.niche]]
-        if (niche < 0).all():
-            return None
-        part = _those(division, niche)
-        parts.append(part)
-        value = value + prediction(part.margins(others), others.comparisons)
-    return Agreement(parts, value, count[0])
+    niches = [number[own][one.niche] for own, one in zip(joined, divisions, strict=True)]
+    if any(bool((niche < 0).all()) for niche in niches):
+        return None
+    parts = [_those(one, niche) for one, niche in zip(divisions, niches, strict=True)]
+    predicted = [
+        prediction(part.margins(others), others.comparisons)
+        for part, others in zip(parts, judged, strict=True)
+    ]
+    return Agreement(parts, torch.stack(predicted).sum(0), count[0])
 
 
 def _served(division: Division) -> Tensor:
@@ -127,10 +123,8 @@ def _served(division: Division) -> Tensor:
 def _those(division: Division, niche: Tensor) -> Division:
     """The members of a division that have a niche, of the numbers given; -1 for those without."""
     members = (niche >= 0).nonzero()[:, 0]
-    share = division.share / division.share.sum()
-    return Division(
-        division.population.subset(members.tolist()),
-        share[members],
-        niche[members],
-        division.value,
+    return division._replace(
+        population=division.population.subset(members.tolist()),
+        share=(division.share / division.share.sum())[members],
+        niche=niche[members],
     )

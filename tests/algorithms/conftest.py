@@ -30,6 +30,22 @@ def ring():
 
 
 @pytest.fixture(scope="session")
+def learn():
+    """``learn(problem, population, weight, steps=...)``: weight of each answer to each member."""
+
+    def train(problem, population, weight, *, steps):
+        loss = problem.loss(population)
+        optimizer = torch.optim.Adam(population.members.parameters(), lr=0.05)
+        for _ in range(steps):
+            losses = loss.pairs(problem.comparisons.preferred, problem.comparisons.other)
+            optimizer.zero_grad()
+            (losses * weight).mean(1).sum().backward()
+            optimizer.step()
+
+    return train
+
+
+@pytest.fixture(scope="session")
 def served():
     """``served(found, bank, comparisons, group)`` for each group."""
 

@@ -28,37 +28,33 @@ def held_out(problem, search, searches=3):
     return Problem(SPEC, problem.bank, comparisons.rows(rows), problem.training)
 
 
-def knows(problem, group, wants):
+def knows(learn, problem, group, wants):
     """A division with a trained member for each group of ``wants``; several may want the same."""
     generator = torch.Generator().manual_seed(0)
     population = problem.initial_population(len(wants), generator=generator)
-    optimizer = torch.optim.Adam(population.members.parameters(), lr=0.05)
     comparisons = problem.comparisons
     weight = torch.stack([torch.isin(group[comparisons.case], torch.tensor(w)) for w in wants])
-    loss = problem.loss(population)
-    for _ in range(150):
-        optimizer.zero_grad()
-        losses = loss.pairs(comparisons.preferred, comparisons.other)
-        (losses * weight).mean(1).sum().backward()
-        optimizer.step()
+    learn(problem, population, weight, steps=150)
     number = len(wants)
     value = torch.zeros(comparisons.num_cases)
     return Division(population, torch.full((number,), 1 / number), torch.arange(number), value)
 
 
-def divided(problem, group, four):
+def divided(learn, problem, group, four):
     """Of one search: divisions into one niche, two, three and four."""
     three = [[0], [1], [2, 3]]
     all_of = [[[0, 1, 2, 3]], [[0, 1], [2, 3]], three, four]
-    return [knows(problem, group, wants) for wants in all_of]
+    return [knows(learn, problem, group, wants) for wants in all_of]
 
 
-def test_a_group_that_one_search_has_lost_is_there(problem):
+def test_a_group_that_one_search_has_lost_is_there(problem, learn):
     """The third has group 0 twice and 2 and 3 together: it says nothing of a niche for 2 alone."""
     problem, group = problem
     right, lost = [[0], [1], [2], [3]], [[0], [0], [1], [2, 3]]
     judged = [held_out(problem, search) for search in range(3)]
-    found = agreements(problem, judged, [divided(problem, group, f) for f in (right, right, lost)])
+    found = agreements(
+        problem, judged, [divided(learn, problem, group, f) for f in (right, right, lost)]
+    )
     four = found[-1]
     assert (four.number, four.found) == (4, 4)
     served = four.served(problem)
@@ -72,11 +68,11 @@ def test_a_group_that_one_search_has_lost_is_there(problem):
     assert [len(part.niche.unique()) for part in four.parts] == [4, 4, 3]
 
 
-def test_what_one_search_alone_has_found_is_dropped(problem):
+def test_what_one_search_alone_has_found_is_dropped(problem, learn):
     problem, group = problem
     two, other = [[0, 1], [2, 3]], [[1, 2], [0, 3]]
     judged = [held_out(problem, search) for search in range(3)]
-    own = [[knows(problem, group, wants)] for wants in (two, two, [*two, other[0]])]
+    own = [[knows(learn, problem, group, wants)] for wants in (two, two, [*two, other[0]])]
     # The third has a niche more, and is cut to as many as the first.
     (found,) = agreements(problem, judged, own)
     assert found.number <= 2
@@ -86,10 +82,10 @@ def test_what_one_search_alone_has_found_is_dropped(problem):
     assert (own.max(1).values > 0.75).all()
 
 
-def test_the_scale_is_the_geometric_mean(problem):
+def test_the_scale_is_the_geometric_mean(problem, learn):
     problem, group = problem
     judged = [held_out(problem, search) for search in range(3)]
-    own = [divided(problem, group, [[0], [1], [2], [3]]) for _ in range(3)]
+    own = [divided(learn, problem, group, [[0], [1], [2], [3]]) for _ in range(3)]
     found = agreements(problem, judged, own)[-1]
     each = [
         found._replace(parts=[part]).scale([others])
@@ -99,11 +95,11 @@ def test_the_scale_is_the_geometric_mean(problem):
     assert all(one > 0 for one in each)
 
 
-def test_one_niche_of_each_search_is_one_niche(problem):
+def test_one_niche_of_each_search_is_one_niche(problem, learn):
     """Whatever the two rank."""
     problem, group = problem
     judged = [held_out(problem, search, 2) for search in range(2)]
-    own = [[knows(problem, group, [[0]])], [knows(problem, group, [[2]])]]
+    own = [[knows(learn, problem, group, [[0]])], [knows(learn, problem, group, [[2]])]]
     (found,) = agreements(problem, judged, own)
     assert found.number == 1
     assert [len(part.niche) for part in found.parts] == [1, 1]
