@@ -11,7 +11,7 @@ from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.population import Population
 from popl_rl.models.preference_likelihood import log_likelihood
 
-__all__ = ["CPLLoss", "cpl_loss", "descend"]
+__all__ = ["CPLLoss", "cloning_weight", "cpl_loss", "descend"]
 
 
 def cpl_loss(
@@ -41,6 +41,11 @@ def cpl_loss(
     """
     loss = -log_likelihood(preferred - conservatism * other, slip)
     return loss - cloning * (preferred + other) / 2 if cloning else loss
+
+
+def cloning_weight(bc: float, *, alpha: float, bank: SegmentBank) -> float:
+    """``bc`` as a weight of scores, which are ``alpha`` times the sum over a segment's steps."""
+    return bc / (alpha * bank.row.shape[1])
 
 
 class CPLLoss(LossModule):
@@ -153,8 +158,8 @@ class CPLLoss(LossModule):
 
     @property
     def cloning(self) -> float:
-        """``bc`` as a weight of scores, which are ``alpha`` times the sum over the steps."""
-        return self.bc / (self.alpha * self.bank.row.shape[1])
+        """The weight of behaviour cloning that ``cpl_loss`` takes."""
+        return cloning_weight(self.bc, alpha=self.alpha, bank=self.bank)
 
     def losses(self, preferred: Tensor, other: Tensor) -> Tensor:
         """Losses of scored pairs, any shape."""

@@ -17,7 +17,7 @@ import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 from torch import Tensor
 
 from popl_rl.algorithms.draws import by_case
-from popl_rl.algorithms.losses import cpl_loss
+from popl_rl.algorithms.losses import cloning_weight, cpl_loss
 from popl_rl.algorithms.problem import Problem
 from popl_rl.config import VPLSettings
 from popl_rl.models.encoded_policy_set import AnswerEncoder, EncodedPolicySet, EncodedRewardSet
@@ -157,7 +157,9 @@ class VPL:
             worse,
             conservatism=self.problem.conservatism,
             slip=recipe.slip,
-            cloning=self.spec.cloning(recipe.bc) / (recipe.alpha * self.problem.bank.row.shape[1]),
+            cloning=cloning_weight(
+                self.spec.cloning(recipe.bc), alpha=recipe.alpha, bank=self.problem.bank
+            ),
         ).mean()
         return loss, divergence(mean, log_std).mean()
 
