@@ -4,6 +4,7 @@ An environment that can list its transitions gives raters exact optimal advantag
 regret) and gives an evaluation exact returns, without a rollout.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -153,14 +154,9 @@ def expected_visits(table: Table, probabilities: Tensor, *, horizon: int) -> Ten
         ``[S, A]`` float64. Its product with any reward of steps is the policy's return.
     """
     policy = probabilities.double()
-    policy = policy / policy.sum(1, keepdim=True)
-    alive = table.start.double() / table.start.double().sum()
     visits = torch.zeros_like(policy)
-    for _ in range(horizon):
-        flow = alive.unsqueeze(1) * policy
+    for flow in _flows(table, policy / policy.sum(1, keepdim=True), horizon=horizon):
         visits += flow
-        flow = flow.masked_fill(table.terminal, 0.0)
-        alive = torch.zeros_like(alive).index_add_(0, table.next_state.flatten(), flow.flatten())
     return visits
 
 
@@ -198,17 +194,22 @@ def policy_return(table: Table, probabilities: Tensor, reward: Tensor, *, horizo
             "each row of probabilities must be non-negative and sum to 1; use softmax(-1), got row "
             f"sums from {float(total.min()):g} to {float(total.max()):g}."
         )
-    policy = policy / total
     gain = reward.double()
+    result = 0.0
+    for flow in _flows(table, policy / total, horizon=horizon):
+        result += float((flow * gain).sum())
+    return result
+
+
+def _flows(table: Table, policy: Tensor, *, horizon: int) -> Iterator[Tensor]:
+    """How often each step of an episode is taken, ``[S, A]``, first step, second step and so on."""
     alive = table.start.double()
     alive = alive / alive.sum()
-    result = 0.0
     for _ in range(horizon):
         flow = alive.unsqueeze(1) * policy
-        result += float((flow * gain).sum())
+        yield flow
         flow = flow.masked_fill(table.terminal, 0.0)
         alive = torch.zeros_like(alive).index_add_(0, table.next_state.flatten(), flow.flatten())
-    return result
 
 
 def _check_reward(table: Table, reward: Tensor) -> None:
