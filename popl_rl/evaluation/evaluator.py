@@ -43,13 +43,12 @@ from popl_rl.evaluation.chosen_questions import ask_new_raters
 from popl_rl.evaluation.held_out_raters import draw_held_out_raters, favourites, gain
 from popl_rl.evaluation.hindsight import score_hindsight
 from popl_rl.evaluation.measures import (
-    episode_returns,
     group_accuracy,
     group_returns,
     held_out_pairs,
     new_rater_answers,
 )
-from popl_rl.evaluation.optimum import ExactReturns, known_scale
+from popl_rl.evaluation.optimum import ExactReturns, known_scale, menu_returns
 from popl_rl.evaluation.protocol import EvaluationProtocol, MeasuredInfos
 from popl_rl.evaluation.references import (
     score_baselines,
@@ -256,7 +255,7 @@ class Evaluator:
             policies = self._policies(hypotheses)
             return Performance(episodes, self._exact(policies), self._exact.of_greedy(policies))
         known = self._exact is not None  # of choosing from menus, all of which are in the episodes
-        own = episode_returns(episodes, self.groups).double().mean(1) if known else None
+        own = menu_returns(episodes, self.groups) if known else None
         return Performance(episodes, own)
 
     def _rows(

@@ -4,11 +4,12 @@ from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from popl_rl.data.tables import Table, expected_visits, policy_return
 from popl_rl.evaluation.acting import Acting, Choosing, Rolling
-from popl_rl.evaluation.measures import recovery
+from popl_rl.evaluation.measures import episode_returns, recovery
 from popl_rl.keys import OBSERVATION
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.raters.groups import RaterGroup
@@ -18,6 +19,7 @@ __all__ = [
     "Scale",
     "action_probabilities",
     "known_scale",
+    "menu_returns",
     "menu_scale",
     "optimal_return",
 ]
@@ -102,6 +104,11 @@ def menu_scale(utility: Tensor, menus: Tensor) -> Scale:
     """
     offered = utility.double()[:, menus]
     return Scale(offered.mean((1, 2)), offered.amax(2).mean(1))
+
+
+def menu_returns(episodes: TensorDictBase, groups: Sequence[RaterGroup]) -> Tensor:
+    """Exact returns of choosing from menus, each of which is an episode, ``[P, G]`` float64."""
+    return episode_returns(episodes, groups).double().mean(1)
 
 
 class ExactReturns(Scale):

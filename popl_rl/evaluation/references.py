@@ -16,7 +16,7 @@ from popl_rl.algorithms.reward_baselines import RewardBaselines
 from popl_rl.data.bank import SegmentBank
 from popl_rl.evaluation.acting import Acting, Choosing, Rolling
 from popl_rl.evaluation.measures import group_accuracy
-from popl_rl.evaluation.optimum import Scale
+from popl_rl.evaluation.optimum import Scale, menu_returns
 from popl_rl.evaluation.results import Performance, Rows
 
 __all__ = ["score_baselines", "score_behaviours", "score_distributional", "score_references"]
@@ -108,7 +108,7 @@ def score_distributional(
     assert isinstance(acting, Choosing)
     for entry, score in rewards.scores(bank).items():
         episodes = acting.choose(score.cpu().unsqueeze(0))
-        chosen = Performance(episodes, rows.returns(episodes).double())
+        chosen = Performance(episodes, menu_returns(episodes, rows.groups))
         accuracy = group_accuracy(score.cpu().unsqueeze(0), pairs)
         for index in range(len(rows.groups)):
             rows.add(entry, index, chosen, torch.ones(1))
