@@ -2,28 +2,38 @@
 
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, cast
+from typing import Any
 
 import pandas as pd
 
 from popl_rl.evaluation.statistics import differs_from_zero, interval, require_columns
 from popl_rl.experiments.markdown import markdown_table
+from popl_rl.experiments.table_rows import (
+    COLUMNS,
+    Entry,
+    Over,
+    column_pairs,
+    difference,
+    difference_text,
+    number_text,
+    rows_of_methods,
+    values_by_seed,
+)
+from popl_rl.experiments.wins_table import WinsTable
 
 __all__ = [
     "COLUMNS",
     "PeopleTable",
     "ResultTable",
+    "WinsTable",
     "fill_tables",
     "make_tables",
     "read_tables",
     "rows_for",
 ]
-
-#: Columns of the rows of a benchmark.
-COLUMNS = ["suite", "scenario", "seed", "method", "choice", "group", "measure", "value"]
 
 _MARKED = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -45,10 +55,10 @@ class ResultTable:
 
     suite: str
     measure: str
-    methods: Mapping[tuple[str, str], str]
+    methods: Mapping[Entry, str]
     scenarios: Mapping[str, str]
-    over: Literal["worst", "mean", "all"] = "worst"
-    against: tuple[str, str] | None = None
+    over: Over = "worst"
+    against: Entry | None = None
 
     def rows(self, results: pd.DataFrame) -> pd.DataFrame:
         """Rows that the table is made from.
@@ -63,7 +73,7 @@ class ResultTable:
             ValueError: If ``results`` lacks a column.
         """
         methods = [*self.methods, *([] if self.against is None else [self.against])]
-        rows = _rows_of(results, self.suite, methods)
+        rows = rows_of_methods(results, self.suite, methods)
         return rows[
             (rows["measure"] == self.measure)
             & ((rows["group"] == "all") == (self.over == "all"))
@@ -84,10 +94,7 @@ class ResultTable:
         Raises:
             ValueError: If ``results`` lacks a column.
         """
-        key = ["method", "choice", "scenario", "seed"]
-        by_seed = self.rows(results).groupby(key)["value"]
-        each = by_seed.min() if self.over == "worst" else by_seed.mean()
-        value = cast("dict[tuple[str, str, str, int], float]", each.to_dict())
+        value = values_by_seed(self.rows(results), self.over)
         places = [(entry, scenario) for entry in self.methods for scenario in self.scenarios]
         cells = dict(zip(places, self._cells(value, places), strict=True))
         lines = [
@@ -99,26 +106,18 @@ class ResultTable:
 
     def _cells(
         self,
-        value: Mapping[tuple[str, str, str, int], float],
-        places: Sequence[tuple[tuple[str, str], str]],
+        value: Mapping[tuple[Entry, str], dict[int, float]],
+        places: Sequence[tuple[Entry, str]],
     ) -> list[str]:
         """A cell for each method and scenario, from a value for each seed."""
-
-        def seeds(entry: tuple[str, str], scenario: str) -> dict[int, float]:
-            return {
-                key[3]: number for key, number in value.items() if key[:3] == (*entry, scenario)
-            }
-
-        found = [seeds(entry, scenario) for entry, scenario in places]
         if self.against is None:
-            return [_cell(list(own.values())) for own in found]
-        other = [seeds(self.against, scenario) for _, scenario in places]
+            return [_cell(list(value.get(place, {}).values())) for place in places]
         pairs = [
-            [own[seed] - its[seed] for seed in own.keys() & its.keys()]
-            for own, its in zip(found, other, strict=True)
+            difference(value.get(place, {}), value.get((self.against, place[1]), {}))
+            for place in places
         ]
         return [
-            _difference(one, sure)
+            difference_text(one) + "*" * sure
             for one, sure in zip(pairs, differs_from_zero(pairs), strict=True)
         ]
 
@@ -146,9 +145,9 @@ class PeopleTable:
         Raises:
             ValueError: If ``results`` lacks a column.
         """
-        rows = _rows_of(results, self.suite, self.methods)
+        rows = rows_of_methods(results, self.suite, self.methods)
         wanted = {(g, name) for g, measure in self.columns for name in _with_ends(measure)}
-        return rows[_pairs(rows, "group", "measure").isin(list(wanted))]
+        return rows[column_pairs(rows, "group", "measure").isin(list(wanted))]
 
     def markdown(self, results: pd.DataFrame) -> str:
         """Lay the table out.
@@ -174,21 +173,6 @@ class PeopleTable:
         return markdown_table(["method", *self.columns.values()], lines, right=len(self.columns))
 
 
-def _rows_of(results: pd.DataFrame, suite: str, methods: Iterable[tuple[str, str]]) -> pd.DataFrame:
-    """Rows of a suite, and of methods by their names and choices."""
-    require_columns(results, COLUMNS)
-    # Without a single choice, pandas reads the column as numbers.
-    choice = results["choice"].astype(object).where(results["choice"].notna(), "")
-    rows = results.assign(choice=choice)
-    named = _pairs(rows, "method", "choice").isin(list(methods))
-    return rows[(rows["suite"] == suite) & named]
-
-
-def _pairs(rows: pd.DataFrame, one: str, other: str) -> pd.Series:
-    """What two columns hold, as a column of pairs."""
-    return pd.Series(list(zip(rows[one], rows[other], strict=True)), rows.index)
-
-
 def _with_ends(measure: str) -> tuple[str, str, str]:
     name, at, answers = measure.partition("@")
     return measure, f"{name}_low{at}{answers}", f"{name}_high{at}{answers}"
@@ -204,14 +188,18 @@ def _mean_and_ends(found: Sequence[float | None]) -> str:
     return text.replace("-", "−")
 
 
-def read_tables(path: Path) -> dict[str, ResultTable | PeopleTable]:
+Table = ResultTable | WinsTable | PeopleTable
+
+
+def read_tables(path: Path) -> dict[str, Table]:
     """Read which tables there are.
 
     Args:
         path: A TOML file with a section for each table: ``suite``, ``measure``, ``methods`` (a list
             of ``[method, choice, label]``) and ``scenarios`` (name = title); or, of real people,
             ``columns`` (a list of ``[group, measure, title]``) in the place of ``measure`` and
-            ``scenarios``. ``over`` and ``against`` as in `ResultTable`.
+            ``scenarios``. ``over`` and ``against`` as in `ResultTable`. With ``wins_of = [method,
+            choice]`` and a list ``measures`` it is a `WinsTable`.
 
     Returns:
         The tables by name.
@@ -220,23 +208,10 @@ def read_tables(path: Path) -> dict[str, ResultTable | PeopleTable]:
         FileNotFoundError: If there is no such file.
         ValueError: If it is no TOML, or a table is not described like that.
     """
-    tables: dict[str, ResultTable | PeopleTable] = {}
+    tables: dict[str, Table] = {}
     for name, about in tomllib.loads(path.read_text(encoding="utf-8")).items():
         try:
-            methods = {(method, choice): label for method, choice, label in about["methods"]}
-            if "columns" in about:
-                columns = {(group, measure): title for group, measure, title in about["columns"]}
-                tables[name] = PeopleTable(about["suite"], methods, columns)
-                continue
-            against = about.get("against")
-            tables[name] = ResultTable(
-                about["suite"],
-                about["measure"],
-                methods,
-                about["scenarios"],
-                over=about.get("over", "worst"),
-                against=None if against is None else (against[0], against[1]),
-            )
+            tables[name] = _table(about)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(
                 f"table {name!r} in {path} must have suite, measure, methods as a list of [method, "
@@ -245,9 +220,26 @@ def read_tables(path: Path) -> dict[str, ResultTable | PeopleTable]:
     return tables
 
 
-def rows_for(
-    tables: Mapping[str, ResultTable | PeopleTable], results: pd.DataFrame
-) -> pd.DataFrame:
+def _table(about: Mapping[str, Any]) -> Table:
+    """The table that a section describes."""
+    methods = {(method, choice): label for method, choice, label in about["methods"]}
+    if "columns" in about:
+        columns = {(group, measure): title for group, measure, title in about["columns"]}
+        return PeopleTable(about["suite"], methods, columns)
+    scenarios, over = about["scenarios"], about.get("over", "worst")
+    if "wins_of" in about:
+        method, choice = about["wins_of"]
+        return WinsTable(
+            about["suite"], about["measures"], (method, choice), methods, scenarios, over
+        )
+    against: Entry | None = None
+    if "against" in about:
+        method, choice = about["against"]
+        against = (method, choice)
+    return ResultTable(about["suite"], about["measure"], methods, scenarios, over, against)
+
+
+def rows_for(tables: Mapping[str, Table], results: pd.DataFrame) -> pd.DataFrame:
     """Keep of a benchmark's rows what its tables need, in their order.
 
     Args:
@@ -265,7 +257,7 @@ def rows_for(
     return results.loc[sorted(set(needed)), COLUMNS]
 
 
-def make_tables(tables: Mapping[str, ResultTable | PeopleTable], folder: Path) -> dict[str, str]:
+def make_tables(tables: Mapping[str, Table], folder: Path) -> dict[str, str]:
     """Lay out all tables from the rows in a folder.
 
     Args:
@@ -314,17 +306,4 @@ def _cell(values: Sequence[float]) -> str:
         return "–"
     mean, half = interval(values)
     spread = f" ± {half:.2f}" if len(values) > 1 else ""
-    return f"{_number(mean)}{spread} [{_number(min(values))}]"
-
-
-def _difference(values: Sequence[float], sure: bool) -> str:
-    if not values:
-        return "–"
-    mean, half = interval(values)
-    spread = f" ± {half:.2f}" if len(values) > 1 else ""
-    return f"{_number(mean)}{spread}{'*' if sure else ''}"
-
-
-def _number(value: float) -> str:
-    # Rounded first, so that nothing is written as a negative zero.
-    return f"{round(value, 2) + 0.0:.2f}".replace("-", "−")
+    return f"{number_text(mean)}{spread} [{number_text(min(values))}]"
