@@ -19,6 +19,7 @@ Preferences, batch size ``[M]``:
 | ``answer`` | ``[M]`` | int64 | an ``Answer`` |
 | ``rater`` | ``[M]`` | int64 | id of the person who answered; -1 where it is unknown |
 | ``chance`` | ``[M]`` | float32 | optional soft label: how likely the second is preferred |
+| ``ranking`` | ``[M]`` | int64 | optional: which ranking it is part of; -1 for a comparison |
 | ``("hidden", "group")`` | ``[M]`` | int64 | group of that person. For evaluation only |
 | ``("hidden", "utility")`` | ``[M, 2]`` | float32 | utility of each segment. For evaluation only |
 | ``("hidden", "condition")`` | ``[M]`` | int64 | what people were told. For evaluation only |
@@ -37,6 +38,9 @@ PAIR = "pair"
 ANSWER = "answer"
 RATER = "rater"
 CHANCE = "chance"
+#: A ranking of n items is the comparisons of each item with all behind it. Those that prefer the
+#: same item are one choice out of several, a stage of the Plackett-Luce model.
+RANKING = "ranking"
 HIDDEN = "hidden"
 GROUP = (HIDDEN, "group")
 UTILITY = (HIDDEN, "utility")

@@ -54,15 +54,12 @@ def run(config: Config) -> Result:
             people = people_steps.read_people(config, run_dir)
         told = ["oracle"] if any(people.groups) and config.method.ties == "drop" else []
         methods = [*people_steps.REFERENCES, *told, *config.people.methods]
+        folds = people_steps.make_folds(config, people, config.people.folds)
         table = people_steps.compare_methods(
-            config,
-            people,
-            methods=methods,
-            folds=range(config.people.folds),
-            cells=run_dir / "cells",
+            config, people, methods=methods, folds=folds, cells=run_dir / "cells"
         )
         title = f"Real people: {', '.join(config.people.methods)}"
-        results = people_steps.finish_people(config, people, table, run_dir, title=title)
+        results = people_steps.finish_people(config, people, folds, table, run_dir, title=title)
     return Result(run_dir, results)
 
 

@@ -91,13 +91,12 @@ def _run_people(config: Config, run_dir: Path, *, is_new: bool) -> Result:
     """Learn from real people's answers, and judge by people who were held out."""
     from popl_rl.evaluation.results import Scoreboard
     from popl_rl.experiments import people_steps, steps
-    from popl_rl.experiments.people import split
     from popl_rl.experiments.run_sets import save_anew
 
     # 1. What people said, and who of them is held out.
     with steps.kept_unless_refused(run_dir, is_new=is_new):
         people = people_steps.read_people(config, run_dir)
-        fold = split(people, config.people, 0, ties=config.method.ties, seed=config.seed)
+        (fold,) = people_steps.make_folds(config, people, 1)
 
     # 2. The population, evolved.
     with steps.open_logger(config, run_dir) as logger:
@@ -110,12 +109,12 @@ def _run_people(config: Config, run_dir: Path, *, is_new: bool) -> Result:
         config,
         people,
         methods=[*people_steps.REFERENCES, config.method.name],
-        folds=[0],
+        folds=[fold],
         cells=run_dir / "cells",
         known=lambda name, _: trained if name == config.method.name else None,
     )
     title = f"{config.method.name} on real people"
-    results = people_steps.finish_people(config, people, table, run_dir, title=title)
+    results = people_steps.finish_people(config, people, [fold], table, run_dir, title=title)
     return Result(run_dir, trained.found, Scoreboard(results, {}, {}, config.method.name))
 
 

@@ -4,7 +4,7 @@ Nothing here imports raters: a learner cannot see who voted.
 
 ``problem``: what every method is given (``Problem``) and what every method is (``Method``).
 ``losses``: the CPL loss and the loop that descends it; ``draws``: what members draw from;
-``expectation``: the E-step of mixtures;
+``expectation``: the E-step of mixtures; ``tie_threshold``: what raters call equal;
 ``variation``: how children differ from their parents; ``rater_similarity``: who wants alike.
 ``popl``: POPL; ``assembly``: POPL from its settings; ``refinement``: its last training;
 ``mixture_population``: POPL without rater ids.

@@ -24,7 +24,7 @@ from popl_rl.algorithms.problem import Problem
 from popl_rl.config import EMSettings
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.population import Population
-from popl_rl.models.preference_likelihood import log_likelihood
+from popl_rl.models.preference_likelihood import answer_likelihood
 
 __all__ = ["ChosenEM"]
 
@@ -123,8 +123,8 @@ class ChosenEM:
 
     def _value(self, population: Population) -> Tensor:
         """How well a mixture predicts each rater who was held out, ``[held-out raters]``."""
-        likelihood = log_likelihood(self.judged.margins(population), self.problem.training.slip)
-        comparisons = self.judged.comparisons
+        comparisons, slip = self.judged.comparisons, self.problem.training.slip
+        likelihood = answer_likelihood(self.judged.margins(population), comparisons, slip)
         return predicted(likelihood, comparisons)[comparisons.case.unique()]
 
     def state_dict(self) -> dict[str, Any]:

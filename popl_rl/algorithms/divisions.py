@@ -20,7 +20,7 @@ from popl_rl.algorithms.problem import Problem
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.calibration import fit_response
 from popl_rl.models.population import Population
-from popl_rl.models.preference_likelihood import log_likelihood, per_case
+from popl_rl.models.preference_likelihood import answer_likelihood, per_case
 
 __all__ = ["Division", "divisions", "merge", "prediction", "responsibility", "together"]
 
@@ -135,7 +135,7 @@ def prediction(margin: Tensor, comparisons: Comparisons) -> Tensor:
         ``popl_rl.algorithms.needed.predicted``.
     """
     scale, mistake = fit_response(margin, comparisons)
-    return predicted(log_likelihood(scale * margin, mistake), comparisons)
+    return predicted(answer_likelihood(scale * margin, comparisons, mistake), comparisons)
 
 
 def together(margin: Tensor, share: Tensor, niche: Tensor) -> Tensor:

@@ -12,12 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from popl_rl.algorithms.losses import cpl_loss
 from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.vpl import spread_points
 from popl_rl.config import LoReSettings
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.population import Population
+from popl_rl.models.preference_likelihood import drawn_likelihood, log_likelihood
 from popl_rl.models.schedules import linear_decay
 from popl_rl.models.scoring import case_values, rater_accuracy
 
@@ -91,8 +91,11 @@ class LoRe:
         for _ in range(self.problem.block):
             index = torch.multinomial(chance, size, replacement=True, generator=self.generator)
             weights = self.free[said.case[index]].softmax(1)
-            pair = torch.stack([said.preferred[index], said.other[index]], 1)
-            loss = self._loss(self._look(pair), pair, weights).mean()
+            rows = said.together(index).view(size, -1)
+            pair = torch.cat([said.preferred[rows], said.other[rows]], 1)
+            margin = self._margins(self._look(pair), pair, weights).flatten()
+            slip = self.problem.training.slip
+            loss = -drawn_likelihood(margin, said, index, slip).mean()
             self.optimizer.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]
             self.optimizer.step()
@@ -106,8 +109,8 @@ class LoRe:
             "effective_bases": float(torch.special.entr(share).sum().exp()),
         }
 
-    def _loss(self, seen: Tensor, pair: Tensor, weights: Tensor) -> Tensor:
-        """CPL losses of answers in the eyes of mixtures.
+    def _margins(self, seen: Tensor, pair: Tensor, weights: Tensor) -> Tensor:
+        """CPL's margins of answers in the eyes of mixtures.
 
         Args:
             seen: What the bases say at the segments' steps, as of ``_look``.
@@ -118,8 +121,7 @@ class LoRe:
             ``[P, K]``.
         """
         better, worse = self._scores(seen, pair, weights).chunk(2, 1)
-        slip, conservatism = self.problem.training.slip, self.problem.conservatism
-        return cpl_loss(better, worse, conservatism=conservatism, slip=slip)
+        return better - self.problem.conservatism * worse
 
     def _look(self, segment: Tensor) -> Tensor:
         """Outputs of the bases at the steps of segments ``[P, K]``, ``[B, P, K * T, outputs]``."""
@@ -157,7 +159,8 @@ class LoRe:
         free = start.log().repeat(len(preferred), 1).requires_grad_()
         optimizer = torch.optim.Adam([free], lr=self.settings.learning_rate)
         for _ in range(self.settings.fit_steps):
-            loss = (self._loss(seen, pair, free.softmax(1)) * there).sum()
+            margin = self._margins(seen, pair, free.softmax(1))
+            loss = -(log_likelihood(margin, self.problem.training.slip) * there).sum()
             optimizer.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]
             optimizer.step()

@@ -9,9 +9,9 @@ from popl_rl.algorithms.draws import Draws, uniform
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.population import Population
-from popl_rl.models.preference_likelihood import log_likelihood
+from popl_rl.models.preference_likelihood import drawn_likelihood, log_likelihood
 
-__all__ = ["CPLLoss", "cloning_weight", "cpl_loss", "descend"]
+__all__ = ["CPLLoss", "answer_losses", "cloning_weight", "cpl_loss", "descend"]
 
 
 def cpl_loss(
@@ -41,6 +41,37 @@ def cpl_loss(
     """
     loss = -log_likelihood(preferred - conservatism * other, slip)
     return loss - cloning * (preferred + other) / 2 if cloning else loss
+
+
+def answer_losses(
+    preferred: Tensor,
+    other: Tensor,
+    comparisons: Comparisons,
+    index: Tensor,
+    *,
+    conservatism: float = 1.0,
+    slip: float = 0.0,
+    cloning: float = 0.0,
+) -> Tensor:
+    """CPL losses of drawn answers, as ``cpl_loss``; ties and stages count as what they say.
+
+    Args:
+        preferred: Scores of what ``comparisons.together(index)`` preferred, ``[..., B * J]``.
+        other: Scores of the others, same shape.
+        comparisons: All comparisons.
+        index: Those drawn, ``[..., B]`` or ``[B]``.
+        conservatism: Lambda in (0, 1].
+        slip: Chance that an answer is a slip, in [0, 0.5).
+        cloning: Weight of behaviour cloning, of minus the mean score of an answer's segments.
+
+    Returns:
+        ``[..., B]``, see ``popl_rl.models.preference_likelihood.answer_likelihood``.
+    """
+    loss = -drawn_likelihood(preferred - conservatism * other, comparisons, index, slip)
+    if not cloning:
+        return loss
+    score: Tensor = (preferred + other).unflatten(-1, (index.shape[-1], -1)).mean(-1)
+    return loss - cloning * score / 2
 
 
 def cloning_weight(bc: float, *, alpha: float, bank: SegmentBank) -> float:
@@ -172,7 +203,7 @@ class CPLLoss(LossModule):
         )
 
     def pairs(self, preferred: Tensor, other: Tensor) -> Tensor:
-        """Losses of every member on one batch that all share.
+        """Losses of every member on one batch of strict answers that all share.
 
         Args:
             preferred: Segments that were preferred, ``[B]``.
@@ -183,8 +214,32 @@ class CPLLoss(LossModule):
         """
         return self.losses(*self.scores(torch.cat([preferred, other])).chunk(2, dim=1))
 
+    def answers(self, comparisons: Comparisons, index: Tensor) -> Tensor:
+        """Losses of drawn answers; ties and stages count as what they say.
+
+        Args:
+            comparisons: M comparisons.
+            index: Comparisons of a batch for each member, ``[N, B]``, or of one that all share,
+                ``[B]``.
+
+        Returns:
+            ``[N, B]``.
+        """
+        rows = comparisons.together(index)
+        segment = torch.cat([comparisons.preferred[rows], comparisons.other[rows]], -1)
+        preferred, other = self.scores(segment).chunk(2, dim=1)
+        return answer_losses(
+            preferred,
+            other,
+            comparisons,
+            index,
+            conservatism=self.conservatism,
+            slip=self.slip,
+            cloning=self.cloning,
+        )
+
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Losses of one batch per member.
+        """Losses of one batch of strict answers per member.
 
         Args:
             tensordict: Batch size ``[N, B]`` with segment numbers ``preferred`` and ``other``.
@@ -215,7 +270,7 @@ def descend(
     Args:
         loss: Loss of the population to train.
         optimizer: Over the population's parameters.
-        comparisons: M strict preferences.
+        comparisons: M comparisons; ties and stages count as what they say.
         steps: Number of steps.
         batch_size: Preferences per member and step, drawn with replacement.
         draws: How often each member draws each comparison; all alike if None.
@@ -229,8 +284,12 @@ def descend(
     value = torch.tensor(float("nan"))
     for _ in range(steps):
         index = draws(batch_size, generator)
-        batch = {"preferred": comparisons.preferred[index], "other": comparisons.other[index]}
-        value = loss(TensorDict(batch, index.shape))["loss_cpl"]
+        if comparisons.all_strict:
+            # A call of the module, which runs what is hooked to it.
+            batch = {"preferred": comparisons.preferred[index], "other": comparisons.other[index]}
+            value = loss(TensorDict(batch, index.shape))["loss_cpl"]
+        else:
+            value = loss.answers(comparisons, index).mean(1).sum()
         optimizer.zero_grad(set_to_none=True)
         value.backward()
         optimizer.step()

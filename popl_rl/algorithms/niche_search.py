@@ -27,7 +27,7 @@ from popl_rl.algorithms.specialists import personalise, train_specialists
 from popl_rl.algorithms.stacked_adam import StackedAdam
 from popl_rl.config import NicheSettings, POPLSettings, parse_epsilon
 from popl_rl.models.population import Population
-from popl_rl.models.preference_likelihood import log_likelihood, per_case
+from popl_rl.models.preference_likelihood import answer_likelihood, per_case
 from popl_rl.models.scoring import case_values
 from popl_rl.selection.lexicase import lexicase_given_first
 from popl_rl.selection.mad import mad
@@ -167,7 +167,8 @@ class NicheSearch:
         Without the conservatism of training, under which the chances of an answer and of its
         opposite do not sum to 1: that would count members that find all segments of a rater likely.
         """
-        return log_likelihood(problem.margins(self.stack), problem.training.slip)
+        margin = problem.margins(self.stack)
+        return answer_likelihood(margin, problem.comparisons, problem.training.slip)
 
     def _draw_raters(self, count: int) -> Tensor:
         """Places among the raters, ``[count]``."""

@@ -14,7 +14,7 @@ from popl_rl.models.calibration import fit_scale
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.policies import Spec
 from popl_rl.models.population import Population
-from popl_rl.models.preference_likelihood import log_likelihood
+from popl_rl.models.preference_likelihood import answer_likelihood
 from popl_rl.models.scoring import PassShares, margins, margins_of, pass_shares, segment_scores
 from popl_rl.models.sets import as_set
 from popl_rl.models.style_codes import StyleClone
@@ -120,7 +120,8 @@ class Problem:
             ``[N, M]``.
         """
         other = self.conservatism * scores[:, self.comparisons.other]
-        return log_likelihood(scores[:, self.comparisons.preferred] - other, self.training.slip)
+        margin = scores[:, self.comparisons.preferred] - other
+        return answer_likelihood(margin, self.comparisons, self.training.slip)
 
     def hypothesis_set(self, population: Population) -> HypothesisSet:
         """A population as a set to cater from."""

@@ -151,7 +151,7 @@ class _CrossFitting:
         shape, device = (training.batch_size,), self.share.device
         for _ in range(steps):
             index = torch.randint(len(comparisons), shape, generator=self.generator, device=device)
-            losses = self.loss.pairs(comparisons.preferred[index], comparisons.other[index])
+            losses = self.loss.answers(comparisons, index)
             weight = self.weight[:, index]
             if comparisons.weight is not None:
                 weight = weight * comparisons.weight[index]

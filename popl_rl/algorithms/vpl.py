@@ -17,7 +17,7 @@ import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 from torch import Tensor
 
 from popl_rl.algorithms.draws import by_case
-from popl_rl.algorithms.losses import cloning_weight, cpl_loss
+from popl_rl.algorithms.losses import answer_losses, cloning_weight
 from popl_rl.algorithms.problem import Problem
 from popl_rl.config import VPLSettings
 from popl_rl.models.encoded_policy_set import AnswerEncoder, EncodedPolicySet, EncodedRewardSet
@@ -150,11 +150,14 @@ class VPL:
         mean, log_std = self.encoder(self.problem.bank, preferred, other)
         noise = torch.randn(mean.shape, generator=source, device=mean.device)
         z = mean + log_std.exp() * noise
-        better, worse = self.scores(preferred, z), self.scores(other, z)
+        rows = said.together(index)
+        better, worse = (self.scores(side[rows], z) for side in (said.preferred, said.other))
         recipe = self.problem.training
-        loss = cpl_loss(
+        loss = answer_losses(
             better,
             worse,
+            said,
+            index,
             conservatism=self.problem.conservatism,
             slip=recipe.slip,
             cloning=cloning_weight(

@@ -248,7 +248,10 @@ class MethodConfig:
     needs_ids: bool = False  # whether the method lives on rater ids
     learns: str = "auto"  # policy, reward; auto: reward where there is nothing to do but judge
     cases: str = "rater"  # what lexicase filters on: rater (needs rater ids) or preference
-    ties: str = "drop"  # ties and soft labels: drop, or count by halves (needs rater ids)
+    # Ties and soft labels: drop; count by halves; rao_kupper: by halves but for ties, which a model
+    # of draws explains. The last two need rater ids.
+    ties: str = "drop"
+    tie_threshold: float | None = None  # of rao_kupper, in units of margins; null: fitted
     evolve: str = "all"  # all: whole networks; head: last layers on a shared, frozen trunk; code:
     # style codes fed to a network that was cloned from the data's behaviour and is frozen
     hidden: list[int] = field(default_factory=lambda: [64, 64])  # units of each hidden layer
@@ -295,7 +298,11 @@ class MethodConfig:
         at.expect(not unknown, "reads", f"sections out of {', '.join(SECTIONS)}", unknown)
         at.one_of(self, "learns", ("auto", "policy", "reward"))
         at.expect(self.cases in ("rater", "preference"), "cases", "rater or preference", self.cases)
-        at.one_of(self, "ties", ("drop", "count"))
+        at.one_of(self, "ties", ("drop", "count", "rao_kupper"))
+        if self.tie_threshold is not None:
+            at.positive(self, "tie_threshold", most=20)
+            cure = "null but for method.ties=rao_kupper"
+            at.expect(self.ties == "rao_kupper", "tie_threshold", cure, self.tie_threshold)
         at.one_of(self, "evolve", ("all", "head", "code"))
         at.at_least_one(self, "members", most=10**6)
         at.at_least_one(self, "generations")

@@ -1,7 +1,8 @@
 """Preferences in the form a learner reads: no group, no utility, no rater model."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
 
@@ -9,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from popl_rl.keys import ANSWER, CHANCE, PAIR, RATER, Answer
+from popl_rl.keys import ANSWER, CHANCE, PAIR, RANKING, RATER, Answer
 
 __all__ = ["Comparisons", "Grouped"]
 
@@ -37,7 +38,12 @@ class Comparisons:
 
     A tie that counts, and an answer with a soft label, are two comparisons, one each way, whose
     weights sum to 1: the cross-entropy of a label in [0, 1] (Christiano et al., 2017, section
-    2.2.3). They are comparisons of the same case.
+    2.2.3). They are comparisons of the same case. Under a model of draws (Rao and Kupper, 1967) the
+    two comparisons of a tie are ``tied`` instead.
+
+    A ranking of several items is the comparisons of each item with all behind it: those of one item
+    are a stage, which counts 1 in all (Plackett, 1975; Luce, 1959). How likely stages and ties are:
+    ``popl_rl.models.preference_likelihood``.
 
     Attributes:
         preferred: Segment that was preferred, ``[M]``.
@@ -47,7 +53,12 @@ class Comparisons:
         num_dropped: Ties and skips that were left out.
         weight: How much each comparison counts, ``[M]`` in (0, 1]; None if all count 1.
         answer: Number of the answer that each comparison is of, ``[M]``, the same for the two
-            comparisons of one answer; None if every comparison is an answer.
+            comparisons of one answer and for those of one ranking; None if every comparison is an
+            answer.
+        stage: Number of the stage that each comparison is of, ``[M]``; None without rankings.
+        tied: Which comparisons are halves of ties, ``[M]`` bool; None without a model of draws.
+        threshold: Of the model of draws, in units of margins: equally good segments are a tie with
+            the chance ``tanh(threshold / 2)``.
     """
 
     preferred: Tensor
@@ -57,6 +68,9 @@ class Comparisons:
     num_dropped: int = 0
     weight: Tensor | None = None
     answer: Tensor | None = None
+    stage: Tensor | None = None
+    tied: Tensor | None = None
+    threshold: float = 0.0
 
     def __len__(self) -> int:
         return len(self.preferred)
@@ -84,6 +98,35 @@ class Comparisons:
         stop = torch.where(last < 0, 0.0, total[last.clamp(min=0)])
         return Grouped(order, total, last, stop)
 
+    @cached_property
+    def stages(self) -> Tensor:
+        """Comparisons of each stage, ``[S, J]``, -1 behind the last; worked out once."""
+        assert self.stage is not None
+        order, size = self.stage.argsort(stable=True), self.stage.bincount()
+        place = torch.arange(len(order), device=order.device)
+        place = place - (size.cumsum(0) - size).repeat_interleave(size)
+        rows = order.new_full((len(size), int(size.max())), -1)
+        return rows.index_put((self.stage[order], place), order)
+
+    @property
+    def all_strict(self) -> bool:
+        """Whether each comparison is judged by itself: no stages, and no ties of a model."""
+        return self.stage is None and self.tied is None
+
+    def together(self, index: Tensor) -> Tensor:
+        """Comparisons without which some cannot be judged: of a stage, all of it.
+
+        Args:
+            index: Comparisons ``[..., B]``.
+
+        Returns:
+            The same; with rankings, J for each, ``[..., B * J]``, itself where its stage has fewer.
+        """
+        if self.stage is None:
+            return index
+        rows = self.stages[self.stage[index]]
+        return torch.where(rows < 0, index.unsqueeze(-1), rows).flatten(-2)
+
     def blocks(self, size: int) -> Iterator[slice]:
         """Slices of at most ``size`` comparisons, all of them one after the other."""
         for start in range(0, len(self), size):
@@ -95,7 +138,7 @@ class Comparisons:
         preferences: TensorDictBase,
         *,
         cases: str,
-        ties: Literal["drop", "count"] = "drop",
+        ties: Literal["drop", "count", "rao_kupper"] = "drop",
     ) -> "Comparisons":
         """Keep the strict answers; or also ties and soft labels, as what they say.
 
@@ -105,27 +148,24 @@ class Comparisons:
             cases: ``"preference"`` or ``"rater"``.
             ties: ``"drop"``: ties are left out, soft labels count as the answer that they are
                 nearer to. ``"count"``: both count by halves, or by their ``chance``; with a case
-                for each rater only, since halves of one answer are no cases.
+                for each rater only, since halves of one answer are no cases. ``"rao_kupper"``: the
+                same, but ties are answers of a model of draws, whose threshold is at first the
+                likeliest of somebody who finds everything equally good.
 
         Returns:
-            The M' strict ones, each with its case; raters' cases are numbered from 0.
+            The M' strict ones, each with its case; raters' cases are numbered from 0. Without
+            raters, a ranking is a case.
 
         Raises:
             ValueError: If ``cases`` or ``ties`` is none of these, rater ids are needed and
-                missing, answers are no ``popl_rl.keys.Answer``, or no answer is strict.
+                missing, answers are no ``popl_rl.keys.Answer``, no answer is strict, or a ranking
+                holds ties, skips or soft labels.
         """
-        if cases not in ("preference", "rater"):
-            raise ValueError(f"cases must be 'preference' or 'rater', got {cases!r}")
-        if ties not in ("drop", "count"):
-            raise ValueError(f"ties must be 'drop' or 'count', got {ties!r}")
-        if cases == "rater" and RATER not in preferences.keys():  # noqa: SIM118 - not a dict
-            raise ValueError(
-                "preferences must hold 'rater', the id of who answered, for cases='rater'; without "
-                "ids use cases='preference'"
-            )
+        _check_arguments(preferences, cases, ties)
         answer = preferences[ANSWER]
         _check_answers(answer)
-        counting = ties == "count" and cases == "rater"
+        ranking = _rankings(preferences)
+        counting = ties != "drop" and cases == "rater"
         kept = answer <= (Answer.TIE if counting else Answer.SECOND)
         if not (answer <= Answer.SECOND).any():
             raise ValueError(
@@ -147,9 +187,12 @@ class Comparisons:
         count, dropped = int(case.max()) + 1, int((~kept).sum())
         doubt = torch.minimum(chance, 1 - chance)
         unsure = (doubt > 0).nonzero().squeeze(-1)
+        if ranking is not None:
+            found = cls(preferred, other, case, count, dropped)
+            return _ranked(found, ranking[kept], is_case=cases == "preference")
         if not len(unsure):
             return cls(preferred, other, case, count, dropped)
-        return cls(
+        found = cls(
             torch.cat([preferred, other[unsure]]),
             torch.cat([other, preferred[unsure]]),
             torch.cat([case, case[unsure]]),
@@ -158,30 +201,37 @@ class Comparisons:
             torch.cat([1 - doubt, doubt[unsure]]),
             torch.cat([torch.arange(len(preferred), device=pair.device), unsure]),
         )
+        tied = said == Answer.TIE
+        if ties == "count" or not tied.any():
+            return found
+        share = float(tied.double().mean())
+        tied = torch.cat([tied, tied[unsure]])
+        return replace(found, tied=tied, threshold=2 * math.atanh(share))
 
     def to(self, device: torch.device | str) -> "Comparisons":
         """The same comparisons on another device."""
-        return Comparisons(
-            self.preferred.to(device),
-            self.other.to(device),
-            self.case.to(device),
-            self.num_cases,
-            self.num_dropped,
-            None if self.weight is None else self.weight.to(device),
-            None if self.answer is None else self.answer.to(device),
-        )
+        return self._each(lambda value: value.to(device))
 
     def rows(self, index: Tensor) -> "Comparisons":
-        """Some of the comparisons; cases keep their numbers, and nothing counts as dropped."""
-        return Comparisons(
-            self.preferred[index],
-            self.other[index],
-            self.case[index],
-            self.num_cases,
-            0,
-            None if self.weight is None else self.weight[index],
-            None if self.answer is None else self.answer[index].unique(return_inverse=True)[1],
+        """Some of the comparisons; cases keep their numbers, and nothing counts as dropped.
+
+        Of a stage of which some comparisons are taken, these are a stage among fewer.
+        """
+        found = self._each(lambda value: value[index])
+        answer, stage = (
+            None if value is None else value.unique(return_inverse=True)[1]
+            for value in (found.answer, found.stage)
         )
+        return replace(found, num_dropped=0, answer=answer, stage=stage)
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> "Comparisons":
+        """The same with every tensor changed."""
+        tensors = {
+            field.name: change(value)
+            for field in fields(self)
+            if isinstance(value := getattr(self, field.name), Tensor)
+        }
+        return replace(self, **tensors)  # type: ignore[arg-type]
 
     def per_answer(self, value: Tensor) -> Tensor:
         """Weighted sums over the comparisons of the same answer, at each of them, ``[..., M]``."""
@@ -190,6 +240,19 @@ class Comparisons:
             return value
         total = value.new_zeros(*value.shape[:-1], int(self.answer.max()) + 1)
         return total.index_add_(-1, self.answer, value)[..., self.answer]
+
+
+def _check_arguments(preferences: TensorDictBase, cases: str, ties: str) -> None:
+    """Raise for unknown words, and where rater ids are needed and missing."""
+    if cases not in ("preference", "rater"):
+        raise ValueError(f"cases must be 'preference' or 'rater', got {cases!r}")
+    if ties not in ("drop", "count", "rao_kupper"):
+        raise ValueError(f"ties must be 'drop', 'count' or 'rao_kupper', got {ties!r}")
+    if cases == "rater" and RATER not in preferences.keys():  # noqa: SIM118 - not a dict
+        raise ValueError(
+            "preferences must hold 'rater', the id of who answered, for cases='rater'; without "
+            "ids use cases='preference'"
+        )
 
 
 def _check_answers(answer: Tensor) -> None:
@@ -213,3 +276,34 @@ def _named(rater: Tensor) -> Tensor:
         return rater
     own = int(rater.max()) + 1 + unknown.cumsum(0)
     return torch.where(unknown, own, rater)
+
+
+def _rankings(preferences: TensorDictBase) -> Tensor | None:
+    """Ranking of each preference, if there are any, all of whose answers are strict."""
+    ranking: Tensor | None = preferences.get(RANKING, None)
+    if ranking is None or not bool((ranking >= 0).any()):
+        return None
+    chance = preferences.get(CHANCE, None)
+    wrong = (preferences[ANSWER] > Answer.SECOND) & (ranking >= 0)
+    if chance is not None or bool(wrong.any()):
+        raise ValueError(
+            "rankings must consist of strict answers (0 or 1), and no soft labels may be beside "
+            f"them, got {int(wrong.sum())} ties and skips in rankings"
+            f"{'' if chance is None else ' and soft labels'}; leave such rankings out"
+        )
+    return ranking
+
+
+def _ranked(said: Comparisons, ranking: Tensor, *, is_case: bool) -> Comparisons:
+    """Strict answers, with the rankings and stages that they are part of."""
+    own = int(ranking.max()) + 1 + torch.arange(len(ranking), device=ranking.device)
+    answer = torch.where(ranking < 0, own, ranking).unique(return_inverse=True)[1]
+    stage = torch.stack([answer, said.preferred]).unique(dim=1, return_inverse=True)[1]
+    return replace(
+        said,
+        case=answer if is_case else said.case,
+        num_cases=int(answer.max()) + 1 if is_case else said.num_cases,
+        weight=1.0 / stage.bincount()[stage],
+        answer=answer,
+        stage=stage,
+    )

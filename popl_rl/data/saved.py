@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from popl_rl.keys import ACTION, ANSWER, CHANCE, GROUP, OBSERVATION, PAIR, RATER, Answer
+from popl_rl.keys import ACTION, ANSWER, CHANCE, GROUP, OBSERVATION, PAIR, RANKING, RATER, Answer
 from popl_rl.manifest import digest_of_tensors
 from popl_rl.storage import load_tensordict, read_manifest, save_tensordict
 
@@ -175,6 +175,12 @@ def _check_ids(data: TensorDict, path: Path) -> None:
                 f"{path} must hold {name} as whole numbers, {meaning}, got {ids.min()} of "
                 f"{ids.dtype}; it is damaged or foreign"
             )
+    ranking = data.get(RANKING, None)
+    if ranking is not None and (ranking.is_floating_point() or ranking.min() < -1):
+        raise ValueError(
+            f"{path} must hold ranking as whole numbers from 0, or -1 for a comparison, got "
+            f"{ranking.min()} of {ranking.dtype}; it is damaged or foreign"
+        )
     chance = data.get(CHANCE, None)
     if chance is not None and not ((chance >= 0) & (chance <= 1)).all():
         raise ValueError(f"{path} must hold chances from 0 to 1; it is damaged or foreign")

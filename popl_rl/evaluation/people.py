@@ -83,9 +83,14 @@ def draw_questions(
     for case, count in trials:
         own = order[begin[case] : begin[case] + count]
         own = own[torch.randperm(count, generator=generator)]
+        if comparisons.stage is not None:
+            own = _whole_rankings(comparisons, own)
         kept = max(-(-count // 4), count - most)
-        told.append(own[: count - kept])
-        judged.append(own[count - kept :][:most_judged])
+        asked, rest = own.split([count - kept, kept])
+        if comparisons.stage is not None:
+            asked, rest = _apart(comparisons, asked, rest)
+        told.append(asked)
+        judged.append(rest[:most_judged])
     pad = torch.nn.utils.rnn.pad_sequence
     sizes = torch.tensor([len(rows) for rows in judged])
     padded = pad(judged, batch_first=True)
@@ -96,6 +101,32 @@ def draw_questions(
         padded,
         torch.arange(padded.shape[1]) < sizes.unsqueeze(1),
     )
+
+
+def _apart(comparisons: Comparisons, asked: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
+    """What is told and what is judged by, without the ranking that is in both of them.
+
+    It is told, unless nothing would be left to judge by.
+    """
+    numbers = _answers_of(comparisons, asked), _answers_of(comparisons, rest)
+    new = ~torch.isin(numbers[1], numbers[0])
+    if new.any():
+        return asked, rest[new]
+    return asked[~torch.isin(*numbers)], rest
+
+
+def _answers_of(comparisons: Comparisons, rows: Tensor) -> Tensor:
+    """Number of the answer, such as a ranking, that each comparison is of."""
+    assert comparisons.answer is not None
+    return comparisons.answer[rows]
+
+
+def _whole_rankings(comparisons: Comparisons, rows: Tensor) -> Tensor:
+    """Comparisons in such an order that those of a ranking follow each other."""
+    number = _answers_of(comparisons, rows).unique(return_inverse=True)[1]
+    place = torch.arange(len(rows))
+    first = torch.full_like(place, len(rows)).scatter_reduce(0, number, place, "amin")
+    return rows[first[number].argsort(stable=True)]
 
 
 class Predictor(Protocol):

@@ -21,14 +21,21 @@ from popl_rl.experiments.loggers import RunLogger
 from popl_rl.experiments.metrics import MetricsWriter
 from popl_rl.experiments.people import Fold, People, people_of, split
 from popl_rl.experiments.people_report import people_alarm, write_people_report
-from popl_rl.experiments.people_training import Trained, judge_fold, train_on
+from popl_rl.experiments.people_training import Trained, fit_ties, judge_fold, train_on
 from popl_rl.experiments.progress import Progress
 from popl_rl.experiments.run_manifest import check_own_data, run_id
 from popl_rl.manifest import digest_of_bytes, read_sealed, sealed
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.storage import write_atomic, write_json
 
-__all__ = ["REFERENCES", "compare_methods", "evolve_people", "finish_people", "read_people"]
+__all__ = [
+    "REFERENCES",
+    "compare_methods",
+    "evolve_people",
+    "finish_people",
+    "make_folds",
+    "read_people",
+]
 
 #: What every method is compared with.
 REFERENCES = ("pooled_cpl", "individual")
@@ -61,6 +68,13 @@ def read_people(config: Config, run_dir: Path) -> People:
     if config.data.save and not kept.is_dir():
         write_folder(data, kept, about={"run": run_id(run_dir)})
     return people
+
+
+def make_folds(config: Config, people: People, count: int) -> list[Fold]:
+    """The first folds, with the thresholds of their ties where a model of draws explains these."""
+    ties, seed = config.method.ties, config.seed
+    folds = [split(people, config.people, number, ties=ties, seed=seed) for number in range(count)]
+    return [fit_ties(people, fold, config) for fold in folds]
 
 
 def evolve_people(
@@ -100,7 +114,7 @@ def compare_methods(
     people: People,
     *,
     methods: Sequence[str],
-    folds: Sequence[int],
+    folds: Sequence[Fold],
     cells: Path,
     known: Callable[[str, int], Trained | None] = lambda _name, _fold: None,
 ) -> pd.DataFrame:
@@ -113,7 +127,7 @@ def compare_methods(
         config: Settings of the run.
         people: Everybody.
         methods: Names of the methods.
-        folds: Numbers of the folds.
+        folds: Whom to learn from and who judges.
         cells: Folder for a table of each method and fold.
         known: A method that was trained on a fold already.
 
@@ -124,15 +138,16 @@ def compare_methods(
     tables = []
     done = 0
     with Progress("methods and folds", total=len(methods) * len(folds)) as progress:
-        for number in folds:
-            fold = split(people, config.people, number, ties=config.method.ties, seed=config.seed)
+        for fold in folds:
             for name in methods:
-                path = cells / f"{name}-{number}.csv"
+                path = cells / f"{name}-{fold.number}.csv"
                 if not _is_whole(path):
-                    trained = known(name, number) or train_on(people, fold, config, name, run=train)
+                    trained = known(name, fold.number) or train_on(
+                        people, fold, config, name, run=train
+                    )
                     if trained.found is not None:
-                        shutil.rmtree(cells / f"{name}-{number}", ignore_errors=True)
-                        trained.found.save(cells / f"{name}-{number}")
+                        shutil.rmtree(path.with_suffix(""), ignore_errors=True)
+                        trained.found.save(path.with_suffix(""))
                     table = judge_fold(people, fold, trained, config.people, seed=config.seed)
                     content = table.to_csv(index=False)
                     write_json(_record(path), sealed({"table": digest_of_bytes(content.encode())}))
@@ -170,7 +185,13 @@ def _is_whole(path: Path) -> bool:
 
 
 def finish_people(
-    config: Config, people: People, table: pd.DataFrame, run_dir: Path, *, title: str
+    config: Config,
+    people: People,
+    folds: Sequence[Fold],
+    table: pd.DataFrame,
+    run_dir: Path,
+    *,
+    title: str,
 ) -> pd.DataFrame:
     """Write ``people.csv``, ``results.csv``, the figure and the report; return the results."""
     from popl_rl.plotting.people_plots import people_curves  # matplotlib only where it draws
@@ -186,6 +207,8 @@ def finish_people(
         "answers": f"{len(people.answers)} strict",
         "seed": config.seed,
     }
+    if any(fold.training.tied is not None for fold in folds):
+        about["tie threshold"] = ", ".join(f"{fold.training.threshold:.3g}" for fold in folds)
     warning = people_alarm(results, config.method.name)
     if warning is not None:
         about["alarm"] = warning

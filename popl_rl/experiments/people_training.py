@@ -14,6 +14,7 @@ from popl_rl.algorithms.cpl import GroupCPL, train
 from popl_rl.algorithms.expectation import expect
 from popl_rl.algorithms.lore import LoRe
 from popl_rl.algorithms.problem import Method, Problem
+from popl_rl.algorithms.tie_threshold import with_threshold
 from popl_rl.algorithms.vpl import VPL
 from popl_rl.config import Config, MethodConfig, PeopleConfig
 from popl_rl.data.comparisons import Comparisons
@@ -31,11 +32,19 @@ from popl_rl.experiments.builders import build_method, build_problem
 from popl_rl.experiments.people import Fold, People
 from popl_rl.models.calibration import SCALES
 from popl_rl.models.hypothesis_set import HypothesisSet
-from popl_rl.models.preference_likelihood import log_likelihood, per_case
+from popl_rl.models.preference_likelihood import answer_likelihood, log_likelihood, per_case
 from popl_rl.models.scoring import margins
 from popl_rl.randomness import stream
 
-__all__ = ["Trained", "as_trained", "catered_members", "judge_fold", "method_config", "train_on"]
+__all__ = [
+    "Trained",
+    "as_trained",
+    "catered_members",
+    "fit_ties",
+    "judge_fold",
+    "method_config",
+    "train_on",
+]
 
 _VPL_HIDDEN = (32,)  # where all other hypotheses are linear
 _E_STEPS = 30  # of the shares of a finished set's members
@@ -80,6 +89,7 @@ def method_config(config: MethodConfig, name: str) -> MethodConfig:
     base = MethodConfig(
         cases=config.cases,
         ties=config.ties,
+        tie_threshold=config.tie_threshold,
         learns=config.learns,
         hidden=config.hidden,
         members=config.members,
@@ -91,6 +101,16 @@ def method_config(config: MethodConfig, name: str) -> MethodConfig:
         OmegaConf.structured(base), OmegaConf.create(entry.read_text(encoding="utf-8"))
     )
     return cast("MethodConfig", OmegaConf.to_object(merged))
+
+
+def fit_ties(people: People, fold: Fold, config: Config) -> Fold:
+    """The same fold with the threshold of its model of draws, if ties are answers of one."""
+    problem = with_threshold(
+        build_problem(config.method, people.spec, people.bank, fold.training),
+        threshold=config.method.tie_threshold,
+        generator=stream(config.seed, f"people/{fold.number}/tie threshold"),
+    )
+    return replace(fold, training=problem.comparisons)
 
 
 def train_on(
@@ -192,7 +212,7 @@ def _margins(found: HypothesisSet, people: People, comparisons: Comparisons) -> 
 
 def _shares(margin: Tensor, comparisons: Comparisons) -> Tensor:
     """Shares of the people whom each member speaks for, by EM with the members as they are."""
-    likelihood = per_case(log_likelihood(margin), comparisons)
+    likelihood = per_case(answer_likelihood(margin, comparisons), comparisons)
     share = torch.full((len(margin),), 1 / len(margin))
     for _ in range(_E_STEPS):
         share = expect(likelihood, share).responsibility.mean(1)
@@ -209,7 +229,7 @@ def _scale(margin: Tensor, comparisons: Comparisons) -> float:
     each = []
     for scale in SCALES:
         share = _shares(scale * margin, comparisons)
-        likelihood = per_case(log_likelihood(scale * margin), comparisons)
+        likelihood = per_case(answer_likelihood(scale * margin, comparisons), comparisons)
         each.append(expect(likelihood, share).evidence.mean())
     return SCALES[int(torch.stack(each).argmax())]
 
@@ -220,7 +240,8 @@ def as_trained(name: str, found: HypothesisSet, people: People, fold: Fold) -> T
     learnt = _margins(found, people, fold.training)
     prior = _shares(learnt, fold.training).clamp(min=1e-3).log()
     margin = _margins(found, people, people.answers)
-    best = int(fold.training.weighted(log_likelihood(learnt)).sum(1).argmax())
+    likelihood = per_case(answer_likelihood(learnt, fold.training), fold.training)
+    best = int(likelihood.sum(1).argmax())
     predictors: dict[str, Predictor] = {
         "posterior": SetPredictor(margin, log_prior=prior),
         "mixture": SetPredictor(margin, log_prior=prior, mix=True),
@@ -247,7 +268,7 @@ def _best_em(
         margin = _margins(found, people, fold.validation)
         margin = _scale(margin, fold.validation) * margin
         share = _shares(_margins(found, people, fold.training), fold.training)
-        likelihood = per_case(log_likelihood(margin), fold.validation)
+        likelihood = per_case(answer_likelihood(margin, fold.validation), fold.validation)
         value = float(expect(likelihood, share).evidence.mean())
         if value > most:
             best, most = found, value

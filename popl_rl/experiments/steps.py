@@ -9,6 +9,7 @@ from omegaconf import OmegaConf
 
 from popl_rl.algorithms.problem import Method, Problem
 from popl_rl.algorithms.reward_baselines import RewardBaselines, train_reward_baselines
+from popl_rl.algorithms.tie_threshold import with_threshold
 from popl_rl.algorithms.trainer import MethodTrainer
 from popl_rl.config import Config
 from popl_rl.data.comparisons import Comparisons
@@ -147,6 +148,11 @@ def gather(config: Config, run_dir: Path, place: Place) -> Setting:
         save_anew(typical, run_dir / "clone", run_dir, digests=data.digests)
     comparisons = comparisons.to(config.device)
     problem = build_problem(config.method, spec, bank, comparisons, clone=clone)
+    problem = with_threshold(
+        problem,
+        threshold=config.method.tie_threshold,
+        generator=stream(config.seed, "tie threshold", config.device),
+    )
     evaluator = make_evaluator(config, world, groups, data, spec, clone=typical, seed=config.seed)
     return Setting(world, groups, data, problem, evaluator)
 
@@ -295,10 +301,12 @@ def describe(
     problem = setting.problem
     comparisons, method = problem.comparisons, config.method
     effective = found.effective_number(problem.bank, comparisons)
+    ties = {} if comparisons.tied is None else {"tie threshold": f"{comparisons.threshold:.3g}"}
     return {
         f"{found.folder} in the set": f"{len(found)}, effectively {effective:.1f}",
         "comparisons": f"{len(comparisons)} strict, {comparisons.num_dropped} ties and skips",
         "cases": f"{comparisons.num_cases} ({method.cases}s)",
+        **ties,
         "recipe": ", ".join(f"{name} {value:g}" for name, value in vars(method.training).items()),
         "seed": config.seed,
         **diagnostics(board, setting.evaluator),

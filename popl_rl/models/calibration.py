@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from popl_rl.data.comparisons import Comparisons
-from popl_rl.models.preference_likelihood import MISTAKE, leave_one_out, log_likelihood
+from popl_rl.models.preference_likelihood import MISTAKE, answer_likelihood, leave_one_out
 
 __all__ = ["MISTAKES", "SCALES", "fit_response", "fit_scale"]
 
@@ -41,7 +41,7 @@ def fit_scale(margin: Tensor, comparisons: Comparisons, *, mistake: float = MIST
     if len(margin) == 1 or comparisons.num_cases == len(comparisons):
         return 1.0
     values = [
-        leave_one_out(log_likelihood(scale * margin, mistake), comparisons).mean()
+        leave_one_out(answer_likelihood(scale * margin, comparisons, mistake), comparisons).mean()
         for scale in SCALES
     ]
     return SCALES[int(torch.stack(values).argmax())]
@@ -70,7 +70,7 @@ def fit_response(
     """
 
     def value(scale: float, slip: float) -> float:
-        likelihood = log_likelihood(scale * margin, slip)
+        likelihood = answer_likelihood(scale * margin, comparisons, slip)
         return float(leave_one_out(likelihood, comparisons).mean())
 
     scale = max(_COARSE, key=lambda one: value(one, MISTAKE if mistake is None else mistake))

@@ -8,8 +8,9 @@ from tensordict import TensorDict
 from torch import nn
 
 from popl_rl.algorithms.draws import by_comparison
-from popl_rl.algorithms.losses import CPLLoss, cpl_loss, descend
+from popl_rl.algorithms.losses import CPLLoss, answer_losses, cpl_loss, descend
 from popl_rl.data.bank import SegmentBank
+from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.population import Population
 from popl_rl.models.schedules import linear_decay
@@ -213,6 +214,28 @@ def test_keys_are_declared(hand):
     out = loss(batch_of([[0]], [[1]]))
     assert set(out.keys()) == set(loss.out_keys)
     assert loss.in_keys == ["preferred", "other"]
+
+
+def test_a_ranking_is_cloned_by_the_mean_of_its_segments():
+    # 0 > 1 > 2: a stage of two comparisons, with scores ln 6, ln 3 and 0, and one of one.
+    data = {
+        "pair": [[0, 1], [0, 2], [1, 2]],
+        "answer": [0] * 3,
+        "rater": [0] * 3,
+        "ranking": [0] * 3,
+    }
+    data = TensorDict({name: torch.tensor(value) for name, value in data.items()}, [3])
+    said = Comparisons.from_preferences(data, cases="rater")
+    index = torch.tensor([0, 2])
+    rows = said.together(index)
+    score = torch.tensor([[math.log(6), math.log(3), 0.0]], requires_grad=True)
+    losses = answer_losses(score[:, said.preferred[rows]], score[:, said.other[rows]], said, index)
+    assert losses[0].tolist() == pytest.approx([-math.log(6 / 10), -math.log(3 / 4)])
+    cloned = answer_losses(
+        score[:, said.preferred[rows]], score[:, said.other[rows]], said, index, cloning=0.1
+    )
+    (pull,) = torch.autograd.grad((losses - cloned).sum() / 0.1, score)
+    assert pull[0].tolist() == pytest.approx([1 / 2, 1 / 4 + 1 / 2, 1 / 4 + 1 / 2], abs=1e-5)
 
 
 @pytest.fixture

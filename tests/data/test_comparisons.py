@@ -141,5 +141,7 @@ def test_whoever_is_unknown_is_a_case_alone():
     )
     found = Comparisons.from_preferences(preferences, cases="rater")
     assert found.case.tolist() == [1, 0, 2, 0]
-    with pytest.raises(ValueError, match="ties must be 'drop' or 'count', got 'half'"):
+    with pytest.raises(
+        ValueError, match="ties must be 'drop', 'count' or 'rao_kupper', got 'half'"
+    ):
         Comparisons.from_preferences(preferences, cases="rater", ties="half")

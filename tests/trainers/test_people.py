@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 from popl_rl.models.sets import load_set
+from popl_rl.storage import load_tensordict
 from popl_rl.trainers import export_data, import_data, judge_people
 from popl_rl.trainers.train_popl import run, show
 
@@ -188,3 +189,56 @@ def test_ties_and_soft_labels_count_in_training(config_of, table, tmp_path):
     ]
     result = run(config_of(*SHORT, *more, f"run_dir={tmp_path / 'run'}"))
     assert result.board.value("popl", "all", "accuracy@5", "posterior") > 0.7
+
+
+@pytest.fixture
+def alike(tmp_path):
+    """``alike(say)``: items, and 20 rows of what each of 12 people who agree says, by ``say``."""
+    rng = np.random.default_rng(0)
+    size = rng.normal(size=(30, 2))
+    frame = pd.DataFrame(size, columns=["size", "colour"])
+    frame.insert(0, "item", [f"i{number}" for number in range(30)])
+    frame.to_csv(tmp_path / "items.csv", index=False)
+
+    def make(say):
+        rows = [
+            {"rater": f"p{n}", **say(2 * size[:, 0], rng)} for n in range(12) for _ in range(20)
+        ]
+        pd.DataFrame(rows).to_csv(tmp_path / "said.csv", index=False)
+        return [
+            f"data.load={tmp_path}/said.csv",
+            f"+data.reader_options.items={tmp_path}/items.csv",
+            f"run_dir={tmp_path / 'run'}",
+        ]
+
+    return make
+
+
+def test_the_threshold_of_ties_is_found_and_told(config_of, alike, tmp_path):
+    def say(value, rng):  # Rao and Kupper (1967)
+        one, two = rng.choice(30, 2, replace=False)
+        difference = value[two] - value[one] + np.array([-0.7, 0.7])
+        second, not_first = 1 / (1 + np.exp(-difference))
+        answer = rng.choice(3, p=[1 - not_first, second, not_first - second])
+        return {"first": f"i{one}", "second": f"i{two}", "answer": answer}
+
+    config = config_of(*SHORT, *alike(say), "method.ties=rao_kupper", "people.least=8")
+    board = run(config).board
+    report = (tmp_path / "run" / "report.md").read_text()
+    found = float(report.partition("tie threshold | ")[2].partition(" ")[0])
+    assert found == pytest.approx(0.7, abs=0.2)
+    assert board.value("popl", "all", "accuracy@5", "posterior") > 0.75
+
+
+def test_rankings_are_read_learnt_from_and_the_best_item_wins(config_of, alike):
+    def say(value, rng):  # the largest of value and Gumbel noise first, and so on
+        some = rng.choice(30, 4, replace=False)
+        order = some[np.argsort(-value[some] - rng.gumbel(size=4))]
+        return {"ranking": " > ".join(f"i{number}" for number in order)}
+
+    config = config_of(*SHORT, *alike(say))
+    result = run(config)
+    features = load_tensordict(result.run_dir / "data" / "segments")["observation"][:, 0]
+    utility = result.policies.population(features)[result.policies.fair_member, :, 0]
+    assert int(utility.argmax()) == int(features[:, 0].argmax())
+    assert result.board.value("popl", "all", "accuracy@5", "posterior") > 0.75

@@ -13,7 +13,7 @@ from popl_rl.data.readers.answers import read_answers
 from popl_rl.data.readers.imported import Imported, Names
 from popl_rl.data.readers.problems import Problems
 from popl_rl.data.readers.table import check_sides, preferences_of
-from popl_rl.keys import ACTION, MASK, OBSERVATION, REWARD
+from popl_rl.keys import ACTION, MASK, OBSERVATION, RANKING, REWARD
 
 __all__ = ["read_npz"]
 
@@ -70,6 +70,9 @@ def read_npz(path: Path, *, score: str | None = None, one_sided: bool = False) -
         check_sides(answer, path)
     columns = [_column(arrays, name, len(pair), path) for name in ("rater", "condition")]
     preferences, raters, conditions = preferences_of(pair, answer, chance, *columns)
+    if "ranking" in arrays:
+        ranking = np.asarray(arrays["ranking"], np.int64)
+        preferences[RANKING] = torch.from_numpy(ranking)
     named = [str(name) for name in arrays.get("conditions", [])]
     if named and conditions:
         conditions = [named[int(number)] for number in conditions]

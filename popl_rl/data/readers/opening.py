@@ -32,7 +32,10 @@ def guess_reader(path: Path) -> str:
         return "npz"
     if is_table(path):
         piece = next(read_pieces(path), None)
-        return "chosen" if piece is not None and "chosen" in piece else "table"
+        columns = [] if piece is None else list(piece)
+        if "ranking" in columns and "answer" not in columns:
+            return "rankings"
+        return "chosen" if "chosen" in columns else "table"
     raise ValueError(
         f"no reader is known for {path.name}; name one of {', '.join(names('reader'))}, or one of "
         "your own, such as my_reader.py:read"

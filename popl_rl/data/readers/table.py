@@ -14,7 +14,7 @@ from popl_rl.data.readers.files import first_row, read_pieces
 from popl_rl.data.readers.imported import Imported, Names
 from popl_rl.data.readers.items import Items, read_items, read_segments
 from popl_rl.data.readers.problems import Problems
-from popl_rl.keys import ANSWER, CHANCE, CONDITION, PAIR, RATER, Answer
+from popl_rl.keys import ANSWER, CHANCE, CONDITION, PAIR, RANKING, RATER, Answer
 
 __all__ = ["check_sides", "preferences_of", "read_table"]
 
@@ -32,6 +32,7 @@ def read_table(
     answer: str = "answer",
     rater: str = "rater",
     condition: str = "condition",
+    ranking: str = "ranking",
     one_sided: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> Imported:
@@ -53,6 +54,8 @@ def read_table(
         rater: Column of who answered; need not be there, and may be empty in some rows.
         condition: Column of what people were told or which group they are of; likewise. It is
             kept for evaluation and never read by a learner.
+        ranking: Column of which ranking a comparison is part of; likewise. Rankings as lists are
+            read by ``popl_rl.data.readers.rankings.read_rankings``.
         one_sided: Accept that all answers prefer the same side.
         progress: Called with the number of rows read so far.
 
@@ -71,7 +74,7 @@ def read_table(
     else:
         things = read_segments(Path(str(segments)), length=length)
     columns = {"first": first, "second": second, "answer": answer}
-    pieces = list(_pieces(path, columns, (rater, condition), things, progress))
+    pieces = list(_pieces(path, columns, (rater, condition, ranking), things, progress))
     if not sum(len(piece[0]) for piece in pieces):
         raise ValueError(f"{path} holds no comparisons, only a header")
     pair = np.concatenate([piece[0] for piece in pieces])
@@ -84,6 +87,9 @@ def read_table(
     who = said.get("rater")
     what = said.get("condition")
     preferences, raters, conditions = preferences_of(pair, code, chance, who, what)
+    if "ranking" in said:
+        part = pd.factorize(_as_ids(said["ranking"]).where(said["ranking"].notna()))[0]
+        preferences[RANKING] = torch.from_numpy(part.astype(np.int64))
     names = Names(things.ids, raters, conditions, things.texts)
     return Imported(things.segments, preferences, names)
 
@@ -91,7 +97,7 @@ def read_table(
 def _pieces(
     path: Path,
     columns: dict[str, str],
-    optional: tuple[str, str],
+    optional: tuple[str, str, str],
     things: Items,
     progress: Callable[[int], None] | None,
 ) -> Iterator[tuple[npt.NDArray[np.int64], pd.DataFrame]]:
@@ -115,7 +121,7 @@ def _pieces(
         same = (sides[0] == sides[1]) & (sides[0] >= 0)
         problems.add(same, "an item is compared with itself", start=start)
         kept = {"answer": piece[columns["answer"]]}
-        for name, column in zip(("rater", "condition"), optional, strict=True):
+        for name, column in zip(("rater", "condition", "ranking"), optional, strict=True):
             if column in piece:
                 kept[name] = piece[column]
         yield np.stack(sides, 1), pd.DataFrame(kept)
@@ -127,11 +133,7 @@ def _check_columns(path: Path, piece: pd.DataFrame, columns: dict[str, str]) -> 
     if not missing:
         return
     if "ranking" in piece:
-        raise ValueError(
-            f"{path} holds rankings of several items, which are not read: cutting them into pairs "
-            "would count each ranking many times. Give the comparisons that were asked, with the "
-            "columns 'first', 'second' and 'answer'"
-        )
+        raise ValueError(f"{path} holds rankings of several items; read them by reader=rankings")
     raise ValueError(
         f"{path} must have the columns {list(columns.values())}, {missing} are missing; it has "
         f"{list(piece)}. Other names are given by options, such as first=left"

@@ -24,6 +24,7 @@ from popl_rl.keys import (
     MASK,
     OBSERVATION,
     PAIR,
+    RANKING,
     RATER,
     REWARD,
 )
@@ -114,6 +115,8 @@ def write_csv(data: Imported, path: Path) -> None:
     columns["answer"] = _answers(preferences)
     if CONDITION in preferences.keys(True):
         columns["condition"] = _named(preferences[CONDITION], names.conditions)
+    if RANKING in preferences.keys():  # noqa: SIM118
+        columns["ranking"] = _named(preferences[RANKING], [])
     with written_beside(path) as beside:
         pd.DataFrame(columns).to_csv(beside / "comparisons.csv", index=False)
         if segments.batch_size[1] == 1:
@@ -143,6 +146,8 @@ def write_npz(data: Imported, path: Path) -> None:
     }
     if CHANCE in preferences.keys():  # noqa: SIM118 - not a dict
         arrays["chance"] = preferences[CHANCE].numpy()
+    if RANKING in preferences.keys():  # noqa: SIM118
+        arrays["ranking"] = preferences[RANKING].numpy()
     arrays |= {
         str(key): segments[key].numpy()
         for key in (MASK, REWARD)

@@ -105,7 +105,10 @@ HEAD = "rater,first,second,answer\n"
         (HEAD + "x,a,b,0.5\nx,a,b,2\n", "row 3: among soft labels, the answer is '2'"),
         (HEAD + "x,a,b,\nx,a,b,0\n", "row 2: the answer is missing"),
         ("first,second\na,b\n", r"must have the columns .* \['answer'\] are missing"),
-        ("rater,ranking\nx,a>b>c\n", "holds rankings of several items, which are not read"),
+        (
+            "rater,ranking\nx,a>b>c\n",
+            "read them by reader=rankings",
+        ),
         (HEAD, "holds no comparisons"),
         (HEAD + "x,a,b,0\n" * 10, "all 10 strict answers prefer the first of the pair"),
     ],
