@@ -134,21 +134,10 @@ def show(result: Result) -> None:
     """Print the table and where everything is."""
     from rich.console import Console
 
-    from popl_rl.evaluation.diagnostics import alarm, unexplained
-    from popl_rl.experiments.people_report import people_alarm, people_table
-    from popl_rl.experiments.report import results_table, verdict_lines
+    from popl_rl.experiments.report import print_results
 
     console = Console()
-    results = result.board.results
-    of_people = bool(results["measure"].str.startswith("accuracy@0").any())
-    for line in [] if of_people else verdict_lines(results, result.board.label):
-        console.print(line, soft_wrap=True)
-    console.print(people_table(results) if of_people else results_table(results))
-    warnings = [alarm(results), unexplained(results)]
-    if of_people:
-        warnings = [people_alarm(results, result.board.label)]
-    for warning in filter(None, warnings):
-        console.print(f"alarm: {warning}", style="bold red", highlight=False, soft_wrap=True)
+    print_results(console, result.board.results, result.board.label)
     console.print(f"report, pictures, policies and logs: {result.run_dir}", soft_wrap=True)
 
 

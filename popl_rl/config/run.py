@@ -48,8 +48,14 @@ class EvaluateConfig:
             **dict.fromkeys((setting.name for setting in fields(EvaluationConfig)), MISSING)
         )
     )
-    # Of the held-out pairs, new raters and episodes. The run's seed + 1 if null, which gives other
-    # ones than the run's; the run's seed gives its own.
+    # Where real people judge: curve and repeats; the rest says what was learnt and from whom.
+    people: PeopleConfig = field(
+        default_factory=lambda: PeopleConfig(
+            **dict.fromkeys((setting.name for setting in fields(PeopleConfig)), MISSING)
+        )
+    )
+    # Of the held-out pairs, new raters and episodes, or of which answers are told. The run's seed
+    # + 1 if null, which gives other ones than the run's; the run's seed gives its own.
     seed: int | None = None
 
 

@@ -14,7 +14,7 @@
   ``preflight``: what is looked at before it
   has a folder; ``reevaluation`` of a finished one.
 - Real people: ``encoding`` of their texts, ``people`` who are held out, ``people_training``,
-  ``people_steps`` of a run and its ``people_report``; ``delivery_study``,
+  ``people_steps`` of a run, its ``people_report`` and ``people_reevaluation``; ``delivery_study``,
   ``argument_study`` and ``jailbreak_study``, and ``response_study`` of how people answer.
 - ``markdown`` lays out the tables of all reports, ``tables`` those of the README files, with
   ``wins_table`` and ``table_rows``.

@@ -43,6 +43,8 @@ __all__ = [
     "fit_ties",
     "judge_fold",
     "method_config",
+    "reference",
+    "set_predictors",
     "train_on",
 ]
 
@@ -145,19 +147,8 @@ def train_on(
         weight = torch.ones(1, len(fold.training))
         pooled = run(GroupCPL(problem, weight=weight, generator=generator))
         scale = _scale(_margins(pooled, people, fold.validation), fold.validation)
-        if name == "pooled_cpl":
-            pooled.alpha *= scale
-            predictor = SetPredictor(_margins(pooled, people, people.answers))
-            return Trained(name, {"": predictor}, pooled)
-        own = IndividualPredictor(
-            problem,
-            people.answers,
-            pooled.population,
-            steps=config.people.individual_steps,
-            scale=scale,
-            seed=config.seed,
-        )
-        return Trained(name, {"": own})
+        pooled.alpha *= scale
+        return reference(name, pooled, people, problem, config, scale=scale)
     if name == "em" and settings.em.groups is None:
         return _best_em(people, fold, config, settings, problem, generator, run)
     method = build_method(settings, problem, num_groups=2, generator=generator)
@@ -165,6 +156,39 @@ def train_on(
     if isinstance(method, VPL | LoRe):
         return Trained(name, _told_by_answers(method, people, fold), found)
     return as_trained(name, found, people, fold)
+
+
+def reference(
+    name: str,
+    pooled: HypothesisSet,
+    people: People,
+    problem: Problem,
+    config: Config,
+    *,
+    scale: float,
+) -> Trained:
+    """What methods are compared with: the hypothesis for all, or one for each person.
+
+    Args:
+        name: ``pooled_cpl``, or ``individual``, which tunes the former for each person.
+        pooled: The hypothesis for all, in the scale in which it is believed.
+        people: Everybody.
+        problem: What it was learnt from.
+        config: Settings of the run.
+        scale: The factor by which that is its scale.
+    """
+    if name == "pooled_cpl":
+        predictor = SetPredictor(_margins(pooled, people, people.answers))
+        return Trained(name, {"": predictor}, pooled)
+    own = IndividualPredictor(
+        problem,
+        people.answers,
+        pooled.population,
+        steps=config.people.individual_steps,
+        scale=scale,
+        seed=config.seed,
+    )
+    return Trained(name, {"": own}, pooled)
 
 
 def _told_by_answers(method: VPL | LoRe, people: People, fold: Fold) -> dict[str, Predictor]:
@@ -235,19 +259,23 @@ def _scale(margin: Tensor, comparisons: Comparisons) -> float:
 
 
 def as_trained(name: str, found: HypothesisSet, people: People, fold: Fold) -> Trained:
-    """A set that is catered, that mixes, and of which one serves all."""
+    """A set that is catered, that mixes, and of which one serves all; its scale is chosen."""
     found.alpha *= _scale(_margins(found, people, fold.validation), fold.validation)
+    return Trained(name, set_predictors(found, people, fold), found)
+
+
+def set_predictors(found: HypothesisSet, people: People, fold: Fold) -> dict[str, Predictor]:
+    """What predicts by a set whose scale was chosen, by the choice that it makes."""
     learnt = _margins(found, people, fold.training)
     prior = _shares(learnt, fold.training).clamp(min=1e-3).log()
     margin = _margins(found, people, people.answers)
     likelihood = per_case(answer_likelihood(learnt, fold.training), fold.training)
     best = int(likelihood.sum(1).argmax())
-    predictors: dict[str, Predictor] = {
+    return {
         "posterior": SetPredictor(margin, log_prior=prior),
         "mixture": SetPredictor(margin, log_prior=prior, mix=True),
         "single": SetPredictor(margin[[best]]),
     }
-    return Trained(name, predictors, found)
 
 
 def _best_em(

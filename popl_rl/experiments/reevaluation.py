@@ -1,6 +1,9 @@
 """Evaluating the policies of a finished run again, into a folder of its own in the run's folder."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -20,7 +23,7 @@ from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.reward_set import RewardSet
 from popl_rl.storage import write_atomic, written_beside
 
-__all__ = ["evaluate_again"]
+__all__ = ["evaluate_again", "evaluation_title", "new_evaluation"]
 
 
 def evaluate_again(config: Config, run_dir: Path, *, seed: int) -> tuple[Path, Scoreboard]:
@@ -73,16 +76,30 @@ def evaluate_again(config: Config, run_dir: Path, *, seed: int) -> tuple[Path, S
         "seed": seed,
         **diagnostics(board, evaluator),
     }
+    with new_evaluation(run_dir, evaluation=config.evaluation, seed=seed) as (folder, beside):
+        title = evaluation_title(folder)
+        report = markdown(board.results, title=title, about=about, figures=[], label=board.label)
+        write_atomic(beside / "results.csv", board.results.to_csv(index=False))
+        write_atomic(beside / "report.md", report)
+    return folder, board
+
+
+@contextmanager
+def new_evaluation(run_dir: Path, **settings: Any) -> Iterator[tuple[Path, Path]]:
+    """The next folder ``evaluations/<number>`` of a run, with the settings that led to it.
+
+    Yields:
+        The folder, and another, which becomes it when all is written.
+    """
     # Another process may evaluate the same run.
     with locked(run_dir / "evaluations"):
         number = 1 + len(list((run_dir / "evaluations").glob("[0-9]*")))
         folder = run_dir / "evaluations" / f"{number:03d}"
-        title = f"Evaluation {number} of {run_dir.name}"
-        report = markdown(board.results, title=title, about=about, figures=[], label=board.label)
         with written_beside(folder) as beside:
-            save_config(
-                beside, {"run_dir": str(run_dir), "evaluation": config.evaluation, "seed": seed}
-            )
-            write_atomic(beside / "results.csv", board.results.to_csv(index=False))
-            write_atomic(beside / "report.md", report)
-    return folder, board
+            save_config(beside, {"run_dir": str(run_dir), **settings})
+            yield folder, beside
+
+
+def evaluation_title(folder: Path) -> str:
+    """Heading of the report of an evaluation."""
+    return f"Evaluation {int(folder.name)} of {folder.parents[1].name}"

@@ -6,9 +6,11 @@ from typing import Any
 from urllib.parse import quote
 
 import pandas as pd
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from popl_rl.evaluation.diagnostics import alarm, unexplained
 from popl_rl.evaluation.method_names import method_name
 from popl_rl.evaluation.statistics import (
     HEADLINES,
@@ -22,8 +24,9 @@ from popl_rl.evaluation.statistics import (
 )
 from popl_rl.evaluation.verdicts import FEW, PARTLY, SERVED, verdicts
 from popl_rl.experiments.markdown import markdown_table
+from popl_rl.experiments.people_report import people_alarm, people_table
 
-__all__ = ["markdown", "results_table", "verdict_lines"]
+__all__ = ["markdown", "print_results", "results_table", "verdict_lines"]
 
 _COLOURS = {SERVED: "green", PARTLY: "yellow", FEW: "yellow"}  # of verdicts; red for any other
 
@@ -96,6 +99,25 @@ def verdict_lines(results: pd.DataFrame, label: str) -> list[Text]:
         Text(str(verdict), style=_COLOURS.get(verdict.word, "red"))
         for verdict in verdicts(results, label)
     ]
+
+
+def print_results(console: Console, results: pd.DataFrame, label: str) -> None:
+    """Print the table of a run, and what it warns of.
+
+    Args:
+        console: The terminal.
+        results: Rows of a scoreboard, or over people.
+        label: Name of the method that was run.
+    """
+    of_people = bool(results["measure"].str.startswith("accuracy@0").any())
+    for line in [] if of_people else verdict_lines(results, label):
+        console.print(line, soft_wrap=True)
+    console.print(people_table(results) if of_people else results_table(results))
+    warnings = [alarm(results), unexplained(results)]
+    if of_people:
+        warnings = [people_alarm(results, label)]
+    for warning in filter(None, warnings):
+        console.print(f"alarm: {warning}", style="bold red", highlight=False, soft_wrap=True)
 
 
 def markdown(

@@ -256,6 +256,8 @@ def test_evaluating_a_run_that_is_not_finished(call, copied):
 
 
 def test_evaluating_with_impossible_settings(call, copied):
+    result = call(evaluate_policies.cli, f"run_dir={copied}", "people.repeats=2")
+    assert_explains(result, "people.repeats", "simulated raters")
     result = call(evaluate_policies.cli, f"run_dir={copied}", "evaluation.episodes=0")
     assert_explains(result, "episodes must be at least 1, got 0")
 

@@ -9,8 +9,8 @@ import pytest
 
 from popl_rl.models.sets import load_set
 from popl_rl.storage import load_tensordict
-from popl_rl.trainers import export_data, import_data, judge_people
-from popl_rl.trainers.train_popl import run, show
+from popl_rl.trainers import evaluate_policies, export_data, import_data, judge_people
+from popl_rl.trainers.train_popl import Result, run, show
 
 SHORT = [
     "raters=people",
@@ -95,20 +95,64 @@ def test_export_keeps_who_answered(imported, tmp_path, capsys):
     assert "336 comparisons written" in capsys.readouterr().out
 
 
-def test_a_run_learns_from_people_and_tells_them_apart(config_of, imported, tmp_path, capsys):
-    result = run(config_of(*SHORT, f"data.load={imported}", f"run_dir={tmp_path / 'run'}"))
-    board = result.board
+@pytest.fixture(scope="module")
+def finished(config_of, imported, tmp_path_factory):
+    """A run that has learnt from the people."""
+    run_dir = tmp_path_factory.mktemp("finished") / "run"
+    return run(config_of(*SHORT, f"data.load={imported}", f"run_dir={run_dir}"))
+
+
+def test_a_run_learns_from_people_and_tells_them_apart(finished, capsys):
+    result, board = finished, finished.board
     catered = board.value("popl", "all", "accuracy@5", "posterior")
     assert catered > board.value("pooled_cpl", "all", "accuracy@5") + 0.2
     # Groups are told by a column, and have rows of their own.
     assert board.value("popl", "large", "people@5") + board.value("popl", "small", "people@5") == 8
     for name in ("people.csv", "results.csv", "report.md", "figures/people.png", "metrics.csv"):
-        assert (tmp_path / "run" / name).is_file()
-    assert len(load_set(tmp_path / "run" / "rewards")) == len(result.policies)
+        assert (result.run_dir / name).is_file()
+    assert len(load_set(result.run_dir / "rewards")) == len(result.policies)
     show(result)
     assert "How many further answers of new people" in capsys.readouterr().out
-    people = pd.read_csv(tmp_path / "run" / "people.csv")
+    people = pd.read_csv(result.run_dir / "people.csv")
     assert people.groupby("method")["person"].nunique().eq(8).all()
+
+
+def test_a_finished_run_is_judged_again_by_the_people_it_held_out(config_of, finished, capsys):
+    run_dir = finished.run_dir
+    own = evaluate_policies.run(config_of(f"run_dir={run_dir}", "seed=0", name="evaluate"))[1]
+    pd.testing.assert_frame_equal(own.results, finished.board.results)
+    asked = [f"run_dir={run_dir}", "people.curve=[0,3]", "people.repeats=2"]
+    folder, board = evaluate_policies.run(config_of(*asked, name="evaluate"))
+    assert folder == run_dir / "evaluations" / "002"
+    assert board.value("popl", "all", "people@3", "posterior") == 8
+    assert board.value("popl", "all", "accuracy@3", "posterior") > 0.8
+    assert math.isfinite(board.value("individual", "all", "accuracy@3"))
+    people = [pd.read_csv(path / "people.csv") for path in (run_dir, folder)]
+    assert set(people[0]["person"]) == set(people[1]["person"])
+    for name in ("config.yaml", "results.csv", "report.md", "figures/people.png"):
+        assert (folder / name).is_file()
+    show(Result(folder, finished.policies, board))
+    assert "after 3" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["evaluation.answers=5"], "real people judge this one; .* such as people.curve="),
+        (["people.folds=2"], "people.folds says from whom a run learns .* only people.curve"),
+        (["people.curve=[-1]"], "people.curve"),
+    ],
+)
+def test_what_a_finished_run_cannot_be_asked_is_refused(config_of, finished, settings, message):
+    with pytest.raises(ValueError, match=message):
+        evaluate_policies.run(config_of(f"run_dir={finished.run_dir}", *settings, name="evaluate"))
+
+
+def test_what_predicts_by_more_than_its_set_is_not_judged_again(config_of, imported, tmp_path):
+    more = [f"data.load={imported}", f"run_dir={tmp_path / 'run'}"]
+    run(config_of("method=lore", *SHORT, "method.generations=1", *more))
+    with pytest.raises(ValueError, match=r"runs of method lore .* by popl-people"):
+        evaluate_policies.run(config_of(f"run_dir={tmp_path / 'run'}", name="evaluate"))
 
 
 def test_conditions_are_never_read_by_a_learner(config_of, table, tmp_path):
