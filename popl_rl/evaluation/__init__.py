@@ -3,9 +3,10 @@
 - What hypotheses do: ``acting`` rolls policies out, plans for reward functions or chooses items;
   ``ppo`` trains policies on reward functions, with episodes from ``ppo_episodes``.
 - What that is worth: ``measures`` of episodes and rankings, ``optimum`` with exact returns,
-  ``best_of_set`` and its worth in ``hindsight``, ``held_out_raters``, ``unexplained_raters`` and
-  ``ranking_agreement``; by the number of answers, to drawn or to ``chosen_questions``, in
-  ``catering_curves``; ``references``: what the data's behaviours and the optimum are worth.
+  ``best_of_set`` and its worth in ``hindsight``, ``held_out_raters``, ``unexplained_raters``,
+  ``guarantees`` and ``ranking_agreement``; by the number of answers, to drawn or to
+  ``chosen_questions``, in ``catering_curves``; ``references``: what the data's behaviours and the
+  optimum are worth.
 - Real people: ``people`` who are held out, ``people_models`` of each of them, and
   ``people_statistics``.
 - What is told: ``evaluator`` fills the ``results`` of a run by a ``protocol``, ``diagnostics`` puts

@@ -9,7 +9,7 @@
   ``run_sets`` and ``plug_ins`` tell whether what is in it belongs together.
 - A benchmark: ``suites`` reads what is compared, ``cells`` plans it and collects what came out,
   ``costs`` foretells what it takes, ``jobs`` runs it in processes, ``benchmark_tables`` and
-  ``benchmark_report`` tell the results.
+  ``benchmark_report`` tell the results; ``guarantees`` counts what its sets guarantee.
 - ``steps``: the steps of a training run, in their order, of which ``run_start`` is the first;
   ``preflight``: what is looked at before it
   has a folder; ``reevaluation`` of a finished one.

@@ -6,7 +6,8 @@
 - Of learnt utilities over a line of states: ``utility_plots``, ``agreement_plots`` and
   ``majority_plots``, which share ``state_lines``.
 - Of motion: ``motion_plots`` and ``animation``.
-- Of a benchmark: ``benchmark_plots`` and ``benchmark_curves``, which share ``benchmark_style``.
+- Of a benchmark: ``benchmark_plots`` and ``benchmark_curves``, which share ``benchmark_style``;
+  ``guarantee_plots`` of what its sets guarantee.
 - Of real people: ``people_plots``, and ``delivery_plots`` of where they drive.
 - ``style`` has the colours and headlines of all.
 """
