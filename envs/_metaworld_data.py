@@ -4,7 +4,8 @@ Of two clips that begin alike, what differs is what was done; of two from anywhe
 the episode had come.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,6 +15,7 @@ from tensordict import TensorDict
 
 from popl_rl.envs._metaworld_scripts import Scripted
 from popl_rl.keys import ACTION, INFO, OBSERVATION, REWARD
+from popl_rl.processes import Workers
 
 __all__ = ["FILM_STEPS", "Continued", "check_scripted", "collect_continuations"]
 
@@ -71,6 +73,7 @@ def collect_continuations(
     progress: Callable[[int], None] | None = None,
     films: Callable[[int], bool] | None = None,
     keep: Callable[[int, TensorDict, list[Any]], None] | None = None,
+    workers: Workers | None = None,
 ) -> TensorDict:
     """Collect segments of which ``per_start`` at a time begin in one state.
 
@@ -88,6 +91,8 @@ def collect_continuations(
         progress: Called with the number of segments collected so far.
         films: Whether to draw the segment of a number; none of them if None.
         keep: Called with number, steps and pictures of each segment that is drawn.
+        workers: Processes that collect side by side, with the same result; this one if None. They
+            draw no films.
 
     Returns:
         TensorDict ``[starts * per_start, T]``; segments of one start follow each other, and
@@ -97,7 +102,7 @@ def collect_continuations(
         ValueError: If a count is not positive or ``per_start`` exceeds the behaviours.
     """
     behaviours = env.behaviours()
-    styles = [what for name, what in behaviours.items() if name.startswith("scripted/")]
+    styles = [one for one in behaviours.items() if one[0].startswith("scripted/")]
     leads = [what for name, what in behaviours.items() if name.startswith("rough/")]
     if not 1 <= per_start <= len(styles):
         raise ValueError(f"per_start must be 1 to {len(styles)}, got {per_start}.")
@@ -105,30 +110,110 @@ def collect_continuations(
     for name, value in counts.items():
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}.")
-    segments: list[TensorDict] = []
-    while len(segments) < starts * per_start:
+    go_on: _Here | _Elsewhere = _Here(env, length, generator, progress, films, keep)
+    if workers is not None and films is None:
+        go_on = _Elsewhere(env, length, generator, progress, workers)
+    start = 0
+    while start < starts:
         seed = int(torch.randint(2**31, (), generator=generator))
         lead = leads[int(torch.randint(len(leads), (), generator=generator))]
         visited, _ = _episode(env, lead, seed, generator)
         # Always the reset: a policy acts from there every time, and few states look like it.
         later = 1 + torch.randperm(len(visited) - 1, generator=generator)
         chosen = torch.cat([torch.zeros(1, dtype=torch.long), later])[:starts_per_episode]
-        for index in chosen.tolist():
-            start = len(segments) // per_start
-            if start == starts:
-                break
-            for style in torch.randperm(len(styles), generator=generator)[:per_start].tolist():
-                drawn = films is not None and films(len(segments))
-                film: list[Any] | None = [] if drawn else None
-                steps = _continue(env, visited[index], styles[style], length, generator, film)
-                if keep is not None and film is not None:
-                    keep(len(segments), steps, film)
-                steps[INFO, "start"] = torch.full((length,), start)
-                segments.append(steps)
-            if progress is not None:
-                progress(len(segments))
-    collected: TensorDict = torch.stack(segments)  # type: ignore[call-overload]
+        for index in chosen[: starts - start].tolist():
+            order = torch.randperm(len(styles), generator=generator)[:per_start]
+            go_on(visited[index], [styles[style] for style in order.tolist()])
+            start += 1
+    collected: TensorDict = torch.stack(go_on.segments())  # type: ignore[call-overload]
+    number = torch.arange(starts).repeat_interleave(per_start)
+    collected[INFO, "start"] = number.unsqueeze(1).expand(-1, length).clone()
     return collected
+
+
+class _Here:
+    """Goes on from states in this process."""
+
+    def __init__(
+        self,
+        env: Continued,
+        length: int,
+        generator: torch.Generator,
+        progress: Callable[[int], None] | None,
+        films: Callable[[int], bool] | None,
+        keep: Callable[[int, TensorDict, list[Any]], None] | None,
+    ) -> None:
+        self.env, self.length, self.generator = env, length, generator
+        self.progress, self.films, self.keep = progress, films, keep
+        self._found: list[TensorDict] = []
+
+    def __call__(self, state: Any, styles: Sequence[tuple[str, Scripted]]) -> None:
+        """Go on from a state in each of some styles."""
+        for _, style in styles:
+            number = len(self._found)
+            film: list[Any] | None = [] if self.films is not None and self.films(number) else None
+            steps = _continue(self.env, state, style, self.length, self.generator, film)
+            if self.keep is not None and film is not None:
+                self.keep(number, steps, film)
+            self._found.append(steps)
+        if self.progress is not None:
+            self.progress(len(self._found))
+
+    def segments(self) -> list[TensorDict]:
+        """What was collected."""
+        return self._found
+
+
+class _Elsewhere:
+    """Has workers go on from states, each state's segments in one of them.
+
+    How much randomness a segment takes is known before it is collected, so that the generator goes
+    through the same states as if it were collected here.
+    """
+
+    def __init__(
+        self,
+        env: Continued,
+        length: int,
+        generator: torch.Generator,
+        progress: Callable[[int], None] | None,
+        workers: Workers,
+    ) -> None:
+        self.env, self.length, self.generator = env, length, generator
+        self.progress, self.workers = progress, workers
+        self._asked: list[Future[list[dict[str, Any]]]] = []
+
+    def __call__(self, state: Any, styles: Sequence[tuple[str, Scripted]]) -> None:
+        """Ask for segments from a state in each of some styles."""
+        begins = []
+        for name, style in styles:
+            begins.append((name, self.generator.get_state().numpy()))
+            style.skip(self.length, self.generator)
+        worker = len(self._asked) % len(self.workers)
+        asked = self.workers.submit(worker, _continue_each, self.env, state, begins, self.length)
+        self._asked.append(asked)
+
+    def segments(self) -> list[TensorDict]:
+        """What was collected, once all of it is."""
+        found: list[TensorDict] = []
+        for asked in self._asked:
+            found += [TensorDict(steps, [self.length]) for steps in asked.result()]
+            if self.progress is not None:
+                self.progress(len(found))
+        return found
+
+
+def _continue_each(
+    env: Continued, state: Any, begins: Sequence[tuple[str, NDArray[np.uint8]]], length: int
+) -> list[dict[str, Any]]:
+    """Segments of a worker, as arrays: tensors would each hold a file open until they are read."""
+    env.reset(seed=0)  # from then on the simulator's attributes are those of any episode
+    behaviours, generator = env.behaviours(), torch.Generator()
+    found = []
+    for name, begin in begins:
+        generator.set_state(torch.from_numpy(begin))
+        found.append(_continue(env, state, behaviours[name], length, generator).numpy())
+    return found
 
 
 def check_scripted(

@@ -66,19 +66,34 @@ class Scripted:
         asked = np.stack([self._script(row.astype(np.float64)) for row in observation])
         action = torch.from_numpy(asked).float().clamp(-1, 1)
         move = action[:, :3].clamp(-self._limit, self._limit)
+        noise, chance, direction = self._draw(move.shape, generator)
         if self.noise:
-            move += self._limit * self.noise * torch.randn(move.shape, generator=generator)
+            move += self._limit * self.noise * noise
         if self.push:
-            move = self._pushed(move, generator)
+            move = self._pushed(move, chance, direction)
         action[:, :3] = move.clamp(-1, 1)
         return action
 
-    def _pushed(self, move: Tensor, generator: torch.Generator) -> Tensor:
+    def skip(self, steps: int, generator: torch.Generator) -> None:
+        """Draw what as many steps of one episode would draw, so that others can take them."""
+        for _ in range(steps):
+            self._draw(torch.Size([1, 3]), generator)
+
+    def _draw(self, shape: torch.Size, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """Noise, chances of pushes and their directions; empty where there are none."""
+        noise = chance = direction = torch.empty(0)
+        if self.noise:
+            noise = torch.randn(shape, generator=generator)
+        if self.push:
+            chance = torch.rand(shape[0], generator=generator)
+            direction = torch.randn(shape, generator=generator)
+        return noise, chance, direction
+
+    def _pushed(self, move: Tensor, chance: Tensor, drawn: Tensor) -> Tensor:
         if len(self._left) != len(move):
             self._direction, self._left = torch.zeros_like(move), torch.zeros(len(move))
-        begins = torch.rand(len(move), generator=generator) < self.push
+        begins = chance < self.push
         begins &= self._left == 0
-        drawn = torch.randn(move.shape, generator=generator)
         drawn *= self._limit / drawn.norm(dim=-1, keepdim=True)
         self._direction = torch.where(begins.unsqueeze(-1), drawn, self._direction)
         self._left = torch.where(begins, float(_PUSH_STEPS), (self._left - 1).clamp(min=0))

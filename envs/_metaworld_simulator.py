@@ -60,6 +60,14 @@ class SimulatorState:
     site_pos: Array
     attributes: dict[str, Any] = field(repr=False)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What another process goes on from, once its own simulator of the task was reset.
+
+        What looks into MuJoCo's memory here looks into that of the other simulator there already.
+        """
+        kept = {name: value for name, value in self.attributes.items() if not _is_of_mujoco(value)}
+        return {**vars(self), "attributes": kept}
+
 
 class Simulator:
     """Metaworld's environment of one task with its goal visible, and its state in hand.
@@ -173,6 +181,15 @@ def _kept(value: Any) -> Any:
     One that looks into MuJoCo's data must go on doing so, and none of these is written to.
     """
     return value.copy() if isinstance(value, np.ndarray) and value.flags.owndata else value
+
+
+def _is_of_mujoco(value: Any) -> bool:
+    """Whether an array looks into memory of MuJoCo's, not into another array."""
+    while isinstance(value, np.ndarray) and not value.flags.owndata:
+        if not isinstance(value.base, np.ndarray):
+            return True
+        value = value.base
+    return False
 
 
 def _below(model: Any, name: str) -> NDArray[np.bool_]:

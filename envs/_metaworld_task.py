@@ -22,6 +22,7 @@ from popl_rl.envs._metaworld_simulator import (
     task_name,
 )
 from popl_rl.keys import ACTION
+from popl_rl.processes import Workers
 
 __all__ = ["SPEEDS", "STEP_SECONDS", "MetaworldTask", "TaskState"]
 
@@ -33,7 +34,7 @@ SPEEDS = (0.25, 0.4, 0.6, 0.8)
 
 @dataclass(frozen=True)
 class TaskState:
-    """What ``MetaworldTask.set_state`` goes on from; valid in the process that made it.
+    """What ``MetaworldTask.set_state`` goes on from, in another process after a reset there.
 
     Attributes:
         simulator: The simulator's own state.
@@ -58,7 +59,9 @@ class TaskState:
     info: dict[str, Any]
 
 
-class MetaworldTask(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+class MetaworldTask(
+    gymnasium.Env[NDArray[np.float32], NDArray[np.float32]], gymnasium.utils.EzPickle
+):
     """One of Metaworld's tasks, repaired: goal visible, seeded, float32, numbers in every info.
 
     Observations are Metaworld's 39 numbers: hand, gripper, objects (18), the same a step earlier
@@ -110,6 +113,16 @@ class MetaworldTask(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         size: int = 240,
         camera: str = "corner2",
     ) -> None:
+        gymnasium.utils.EzPickle.__init__(
+            self,
+            task,
+            max_steps=max_steps,
+            terminate=terminate,
+            speeds=tuple(speeds),
+            render_mode=render_mode,
+            size=size,
+            camera=camera,
+        )
         self.task = task_name(task)
         self.speeds = tuple(speeds)
         if max_steps < 1:
@@ -211,6 +224,7 @@ class MetaworldTask(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         *,
         generator: torch.Generator,
         progress: Callable[[int], None] | None = None,
+        workers: Workers | None = None,
     ) -> TensorDict:
         """Collect segments: from each of many states, one at each of the scripted speeds.
 
@@ -222,6 +236,7 @@ class MetaworldTask(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             length: Steps of each.
             generator: Source of all randomness.
             progress: Called with the number of segments collected so far.
+            workers: Processes that collect side by side, with the same result; this one if None.
 
         Raises:
             ValueError: If the scripted policy rarely does the task, or a number does not fit.
@@ -232,6 +247,8 @@ class MetaworldTask(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
                 f"data.segments must be a multiple of the scripted speeds, of which two or more "
                 f"are needed, got {num_segments} segments and {speeds} speeds."
             )
+        if workers is not None:
+            workers.start()  # which takes about as long as the check
         check_scripted(self, episodes=4)
         return collect_continuations(
             self,
@@ -240,6 +257,7 @@ class MetaworldTask(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             length=length,
             generator=generator,
             progress=progress,
+            workers=workers,
         )
 
     def record_segments(

@@ -15,6 +15,7 @@ from popl_rl.data.comparisons import Comparisons
 from popl_rl.data.segments import collect_segments, segment_buffer
 from popl_rl.experiments.builders import build_method, build_problem
 from popl_rl.models.policies import PolicySpec
+from popl_rl.processes import Workers
 from popl_rl.raters.collector import collect_preferences
 from popl_rl.raters.groups import make_groups
 from popl_rl.raters.people import Raters
@@ -65,6 +66,13 @@ def no_command_line_left():
 def tiny():
     """Overrides of ``popl-train`` for a run of a few seconds; the first is for two doors alone."""
     return ["env.options.size=7", *TINY]
+
+
+@pytest.fixture(scope="session")
+def workers():
+    """Two processes that all tests share, because starting them takes seconds."""
+    with Workers(2) as both:
+        yield both
 
 
 @pytest.fixture(scope="session")

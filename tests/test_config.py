@@ -83,6 +83,8 @@ CASES = [
      "env.mixture must be non-negative shares that sum to 1, got {'a': 0.5, 'b': 0.4}"),
     ("env__mixture", {"a": 1.5, "b": -0.5},
      "env.mixture must be non-negative shares that sum to 1, got {'a': 1.5, 'b': -0.5}"),
+    ("workers", "some", "workers must be auto, or a number from 1 to 1024, got 'some'"),
+    ("workers", "0", "workers must be auto, or a number from 1 to 1024, got '0'"),
     ("raters__groups", [],
      "raters.groups must be one or more rater references, such as [my_raters.py:fast,"
      "my_raters.py:careful], unless people's answers are in "

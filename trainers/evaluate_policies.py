@@ -10,7 +10,7 @@ told; with the run's seed the same.
 
 popl-evaluate run_dir=runs/<name>                         # as the run did, other raters
 popl-evaluate run_dir=runs/<name> evaluation.answers=5    # cater from five answers
-popl-evaluate run_dir=runs/<name> seed=1 evaluation.episodes=1000
+popl-evaluate run_dir=runs/<name> seed=1 evaluation.episodes=1000 workers=auto
 popl-evaluate run_dir=runs/<name> people.curve=[0,5,50]   # of a run on real people's answers
 """
 
@@ -21,9 +21,10 @@ from typing import TYPE_CHECKING, Any
 import hydra
 from omegaconf import OmegaConf
 
-from popl_rl.config import Checker, Config, EvaluateConfig, plain, validate
+from popl_rl.config import Checker, Config, EvaluateConfig, check_workers, plain, validate
 from popl_rl.experiments.run_manifest import load_run_config
 from popl_rl.interruption import importing
+from popl_rl.processes import workers_for
 from popl_rl.trainers.command import register_schemas, run_command
 
 if TYPE_CHECKING:
@@ -34,8 +35,9 @@ def run(config: EvaluateConfig) -> tuple[Path, "Scoreboard"]:
     """Evaluate again; returns the folder that was written and the scoreboard."""
     problems: list[str] = []
     Checker("", problems).seed(config)
+    check_workers(config.workers, Checker("", problems))
     if problems:
-        raise ValueError(problems[0])
+        raise ValueError("; ".join(problems))
     run_dir = Path(config.run_dir)
     stored = _settings(config, run_dir, has_data=(run_dir / "data").is_dir())
     seed = stored.seed + 1 if config.seed is None else config.seed
@@ -44,8 +46,10 @@ def run(config: EvaluateConfig) -> tuple[Path, "Scoreboard"]:
         from popl_rl.experiments.people_reevaluation import evaluate_people_again
         from popl_rl.experiments.reevaluation import evaluate_again
 
-    evaluate = evaluate_again if stored.raters.groups else evaluate_people_again
-    return evaluate(stored, run_dir, seed=seed)
+    if not stored.raters.groups:
+        return evaluate_people_again(stored, run_dir, seed=seed)
+    with workers_for(config.workers, threads=stored.threads) as workers:
+        return evaluate_again(stored, run_dir, seed=seed, workers=workers)
 
 
 def _settings(config: EvaluateConfig, run_dir: Path, *, has_data: bool) -> Config:

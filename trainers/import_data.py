@@ -14,6 +14,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from popl_rl.config import Checker, check_workers
+from popl_rl.processes import workers_for
 from popl_rl.trainers.command import USER_ERRORS, read_options
 from popl_rl.trainers.terminal import steady_terminal
 
@@ -25,16 +27,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser("popl-import", description=__doc__.splitlines()[0])
     parser.add_argument("path", type=Path, help="file or folder to read")
     parser.add_argument("folder", type=Path, help="folder to write; '-' to look only")
-    parser.add_argument("option", nargs="*", help="name=value of the reader, or of encode=")
+    parser.add_argument(
+        "option", nargs="*", help="name=value of the reader, or of encode=, workers="
+    )
     parser.add_argument("--reader", help="table, npz, chosen, folder or a reference; by itself")
     given = parser.parse_intermixed_args(arguments)
     try:
         options = read_options(given.option)
         encode = options.pop("encode", None)
         cache = options.pop("cache", None)
+        workers = options.pop("workers", "1") if encode else "1"
+        problems: list[str] = []
+        check_workers(workers, Checker("", problems))
+        if problems:
+            raise ValueError(problems[0])
         if str(given.folder) != "-" and given.folder.exists():
             raise FileExistsError(f"{given.folder} exists; remove it or choose another folder")
-        _import(given.path, given.folder, given.reader, options, encode, cache)
+        _import(given.path, given.folder, given.reader, options, encode, cache, workers)
     except USER_ERRORS as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
@@ -48,6 +57,7 @@ def _import(
     options: dict[str, Any],
     encode: str | None,
     cache: str | None,
+    workers: str,
 ) -> None:
     # Imported late, so that a wrong option is told at once.
     from popl_rl.data.readers.opening import open_data
@@ -58,9 +68,13 @@ def _import(
     with Progress("rows", total=None) as progress:
         data = open_data(path, reader=reader, options=options, progress=progress.update)
     if encode is not None:
+        import torch
+
         from popl_rl.experiments.encoding import encoded
 
-        data = encoded(data, encode, cache=None if cache is None else Path(cache))
+        kept = None if cache is None else Path(cache)
+        with workers_for(workers, threads=torch.get_num_threads()) as processes:
+            data = encoded(data, encode, cache=kept, workers=processes)
     for line in summarise(data).lines():
         print(line)
     if str(folder) == "-":

@@ -6,7 +6,7 @@ a whole run; ``stored``: those of an earlier run; ``pages``: what people answer 
 they check themselves; ``overrides``: what somebody typed that changes nothing, or may not change.
 """
 
-from popl_rl.config.checks import MOST, MOST_SEED, Checker, parse_epsilon
+from popl_rl.config.checks import MOST, MOST_SEED, Checker, check_workers, parse_epsilon
 from popl_rl.config.data import DataConfig, EnvConfig, PPOSettings, RatersConfig, ResponseConfig
 from popl_rl.config.evaluation import EvaluationConfig
 from popl_rl.config.method import (
@@ -77,6 +77,7 @@ __all__ = [
     "VPLSettings",
     "changed",
     "changing_nothing",
+    "check_workers",
     "fixed",
     "load_config",
     "parse_epsilon",

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-__all__ = ["MOST", "MOST_SEED", "Checker", "parse_epsilon"]
+__all__ = ["MOST", "MOST_SEED", "Checker", "check_workers", "parse_epsilon"]
 
 #: No count of anything is greater: beyond it is a slip of the finger, or no machine's memory.
 MOST = 10**8
@@ -79,6 +79,13 @@ class Checker:
         """Report a setting that is none of the known words."""
         value = getattr(section, name)
         self.expect(value in known, name, ", ".join(known), value)
+
+
+def check_workers(value: str | int, at: Checker) -> None:
+    """Report a number of worker processes that is neither auto nor a count."""
+    value = str(value)
+    proper = value == "auto" or (value.isdecimal() and 1 <= int(value) <= 1024)
+    at.expect(proper, "workers", "auto, or a number from 1 to 1024", value)
 
 
 def parse_epsilon(epsilon: str | float | None) -> float | str | None:

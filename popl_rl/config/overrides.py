@@ -9,7 +9,7 @@ __all__ = ["CHANGEABLE", "OPEN", "changed", "changing_nothing", "fixed", "unread
 #: Sections whose keys are arguments of a factory or a reader, which no schema lists.
 OPEN = ("env.options", "env.data_options", "env.mixture", "method.options", "data.reader_options")
 #: What may be given beside ``resume=``: nothing of it changes a result.
-CHANGEABLE = ("threads", "checkpoint_interval", "logger", "evaluation.animate")
+CHANGEABLE = ("threads", "workers", "checkpoint_interval", "logger", "evaluation.animate")
 
 
 def changing_nothing(overrides: Sequence[str]) -> list[str]:

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
 
-from popl_rl.config.checks import Checker
+from popl_rl.config.checks import Checker, check_workers
 from popl_rl.config.data import DataConfig, EnvConfig, RatersConfig
 from popl_rl.config.evaluation import EvaluationConfig
 from popl_rl.config.method import MethodConfig
@@ -57,6 +57,7 @@ class EvaluateConfig:
     # Of the held-out pairs, new raters and episodes, or of which answers are told. The run's seed
     # + 1 if null, which gives other ones than the run's; the run's seed gives its own.
     seed: int | None = None
+    workers: str = "1"  # processes that step environments: a number, or auto for all cores
 
 
 @dataclass
@@ -73,6 +74,7 @@ class Config:
     seed: int = 0
     device: str = "cpu"  # where policies are trained: cpu or cuda
     threads: int = 1  # torch threads; on small networks more is slower
+    workers: str = "1"  # processes that step environments: a number, or auto for all cores
     run_dir: str | None = None  # folder of the run; runs/<time>-<method>-<seed> if null
     resume: str | None = None  # folder of a killed run to finish
     checkpoint_interval: int = 10  # generations between checkpoints
@@ -90,6 +92,7 @@ class Config:
         proper = re.fullmatch(r"cpu|cuda(:\d{1,3})?", self.device)
         at.expect(proper is not None, "device", "cpu, cuda, or one of them, as cuda:1", self.device)
         at.at_least_one(self, "threads", most=1024)
+        check_workers(self.workers, at)
         at.at_least_one(self, "checkpoint_interval")
         at.seed(self)
         for name in ("run_dir", "resume"):

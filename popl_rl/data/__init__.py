@@ -5,7 +5,8 @@
   learners take them; ``plugged``: environments of other people and what they offer, checked
   wherever they are called.
 * ``behaviours``: who acts while data are collected; ``rollouts``: whole episodes in lockstep;
-  ``table_rollouts``: the same, looked up in a table.
+  ``table_rollouts``: the same, looked up in a table; ``process_rollouts``: stepped in several
+  processes.
 * ``segments``: episodes cut into segments; ``store``: segments that several runs share;
   ``saved``: segments and preferences in a folder, checked whenever they are read.
 * ``pairs``: random pairs of segments that may be compared.

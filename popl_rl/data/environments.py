@@ -36,6 +36,7 @@ from popl_rl.data.plugged import (
 from popl_rl.data.tables import Table
 from popl_rl.keys import ACTION
 from popl_rl.plug_ins import defined, failure, is_foreign
+from popl_rl.processes import Workers
 from popl_rl.registry import resolve
 
 __all__ = [
@@ -64,6 +65,7 @@ class World:
         table: Exact model, if the environment exposes one.
         collect: The environment's own way to collect segments, if it has one, in the place of
             ``behaviours``.
+        workers: Processes that step environments side by side; this one alone if None.
     """
 
     make: MakeEnv
@@ -73,6 +75,35 @@ class World:
     shares: Mapping[str, float]
     table: Table | None
     collect: Collect | None = None
+    workers: Workers | None = None
+
+
+class _MakeByReference:
+    """Makes an environment from a reference, in any process that it is sent to."""
+
+    def __init__(self, factory: str, env_id: str | None, options: Mapping[str, Any]) -> None:
+        self.factory, self.env_id, self.options = factory, env_id, options
+        self._make_env: Callable[..., gymnasium.Env[Any, Any]] = resolve("env", factory)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _MakeByReference, (self.factory, self.env_id, self.options)
+
+    def __call__(self) -> gymnasium.Env[Any, Any]:
+        make_env = self._make_env
+        leading = () if self.env_id is None else (self.env_id,)
+        build = _make_by_id if self.env_id is not None and make_env is gymnasium.make else make_env
+        try:
+            env = build(*leading, **self.options)
+        except (TypeError, gymnasium.error.Error) as error:
+            raise ValueError(
+                f"env.factory {self.factory!r} cannot be built with id {self.env_id!r} and options "
+                f"{self.options}: {error} ({defined(make_env)})"
+            ) from error
+        except BaseException as error:
+            if isinstance(error, KeyboardInterrupt) or not is_foreign(make_env):
+                raise  # ours say in their own words which option is off
+            raise failure("env", self.factory, "making it", error, make_env) from error
+        return _prepared(env, self.factory, self.factory if self.env_id is None else self.env_id)
 
 
 def make_world(
@@ -83,6 +114,7 @@ def make_world(
     data_options: Mapping[str, Any] | None = None,
     mixture: Mapping[str, float] | None = None,
     choose: Callable[["World"], Mapping[str, Behaviour]] | None = None,
+    workers: Workers | None = None,
 ) -> World:
     """Resolve an environment and read off what it offers.
 
@@ -100,6 +132,7 @@ def make_world(
         mixture: Shares of the behaviours, see ``behaviour_shares``.
         choose: Gives other behaviours in the place of those that the environment has, which may be
             none; None for these.
+        workers: Processes that step environments side by side; this one alone if None.
 
     Raises:
         ValueError: If the environment cannot be resolved or built, what it offers makes no sense,
@@ -107,32 +140,9 @@ def make_world(
         TypeError: If it has no behaviours and its actions cannot be drawn at random, see
             ``popl_rl.data.behaviours.random_behaviour``.
     """
-    make_env = cast("Callable[..., gymnasium.Env[Any, Any]]", resolve("env", factory))
-    leading = () if env_id is None else (env_id,)
-    if env_id is not None and make_env is gymnasium.make:
-        make_env = partial(_make_by_id, env_id)
-        leading = ()
-
-    def build(options: dict[str, Any]) -> gymnasium.Env[Any, Any]:
-        try:
-            env = make_env(*leading, **options)
-        except (TypeError, gymnasium.error.Error) as error:
-            raise ValueError(
-                f"env.factory {factory!r} cannot be built with id {env_id!r} and options "
-                f"{options}: {error} ({defined(make_env)})"
-            ) from error
-        except BaseException as error:
-            if isinstance(error, KeyboardInterrupt) or not is_foreign(make_env):
-                raise  # ours say in their own words which option is off
-            raise failure("env", factory, "making it", error, make_env) from error
-        return _prepared(env, factory, factory if env_id is None else env_id)
-
-    def make() -> gymnasium.Env[Any, Any]:
-        return build(dict(options or {}))
-
-    def make_for_data() -> gymnasium.Env[Any, Any]:
-        return build({**(options or {}), **(data_options or {})})
-
+    own = dict(options or {})
+    make = _MakeByReference(factory, env_id, own)
+    make_for_data = _MakeByReference(factory, env_id, {**own, **(data_options or {})})
     env = make()
     space, first = env.action_space, first_action(env.action_space)
     native = native_spaces(env)[1]
@@ -147,7 +157,7 @@ def make_world(
     collect = None
     if offered(env, "collect_segments") is not None:
         collect = checked_collect(offered(make_for_data(), "collect_segments"), factory)
-    world = World(make, make_for_data, env, behaviours, {}, table, collect)
+    world = World(make, make_for_data, env, behaviours, {}, table, collect, workers)
     if choose is not None:
         behaviours = choose(world)
     elif not behaviours:

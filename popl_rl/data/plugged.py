@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
+from inspect import signature
 from typing import Any, Protocol, cast
 
 import gymnasium
@@ -14,6 +15,7 @@ from popl_rl.data.behaviours import Behaviour, first_action
 from popl_rl.data.tables import Table
 from popl_rl.keys import ACTION, INFO, OBSERVATION
 from popl_rl.plug_ins import PlugInError, call, defined, failure, is_foreign, located
+from popl_rl.processes import Workers
 
 __all__ = [
     "CheckedEnv",
@@ -145,8 +147,12 @@ class Collect(Protocol):
         *,
         generator: torch.Generator,
         progress: Callable[[int], None] | None = None,
+        workers: Workers | None = None,
     ) -> TensorDictBase:
-        """Segments ``[num_segments, length]``; ``progress`` is told how many there are so far."""
+        """Segments ``[num_segments, length]``; ``progress`` is told how many there are so far.
+
+        A method without the argument ``workers`` will do, which knows no other processes.
+        """
         ...
 
 
@@ -294,8 +300,11 @@ def checked_collect(function: Callable[..., Any], name: str) -> Collect:
         *,
         generator: torch.Generator,
         progress: Callable[[int], None] | None = None,
+        workers: Workers | None = None,
     ) -> TensorDictBase:
-        options = {"generator": generator, "progress": progress}
+        options: dict[str, Any] = {"generator": generator, "progress": progress}
+        if workers is not None and "workers" in signature(function).parameters:
+            options["workers"] = workers
         found = call("env", name, "collect_segments", function, num_segments, length, **options)
         with located(function):
             check_segments(found, f"env {name!r}: collect_segments()", (num_segments, length))

@@ -1,7 +1,7 @@
 """Lockstep rollouts: many Gymnasium environments, one batched policy call per step."""
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
@@ -11,10 +11,49 @@ from torch import Tensor
 
 from popl_rl.keys import ACTION, INFO, OBSERVATION, REWARD
 
-__all__ = ["MASK", "clear_after_end", "lockstep", "numeric_info", "stack_resets"]
+__all__ = [
+    "MASK",
+    "EnvBatch",
+    "Outcome",
+    "Start",
+    "clear_after_end",
+    "lockstep",
+    "numeric_info",
+    "stack_resets",
+]
+
+#: What ``reset`` returns, and ``step``.
+Start = tuple[Any, dict[str, Any]]
+Outcome = tuple[Any, float, bool, bool, dict[str, Any]]
 
 #: Key of the ``[B, H]`` bool mask of the steps that were really taken.
 MASK = "mask"
+
+
+class EnvBatch(Protocol):
+    """Environments of one kind that advance together, wherever they are."""
+
+    def reset(self, seeds: Sequence[int]) -> list[Start]:
+        """Begin an episode from each seed, in as many environments."""
+        ...
+
+    def step(self, where: Sequence[int], actions: np.ndarray) -> Iterable[Outcome]:
+        """Step the environments of these numbers, each by its own row of ``actions``."""
+        ...
+
+
+class _OwnEnvs:
+    """Environments of this process."""
+
+    def __init__(self, envs: Sequence[gymnasium.Env[Any, Any]]) -> None:
+        self.envs = envs
+
+    def reset(self, seeds: Sequence[int]) -> list[Start]:
+        return [env.reset(seed=int(seed)) for env, seed in zip(self.envs, seeds, strict=True)]
+
+    def step(self, where: Sequence[int], actions: np.ndarray) -> Iterable[Outcome]:
+        envs = self.envs
+        return (envs[index].step(actions[index]) for index in where)  # type: ignore[misc]
 
 
 def numeric_info(info: dict[str, Any]) -> dict[str, float | int]:
@@ -27,7 +66,7 @@ def numeric_info(info: dict[str, Any]) -> dict[str, float | int]:
 
 
 def lockstep(
-    envs: Sequence[gymnasium.Env[Any, Any]],
+    envs: Sequence[gymnasium.Env[Any, Any]] | EnvBatch,
     act: Callable[[TensorDictBase], Tensor],
     *,
     seeds: Sequence[int],
@@ -36,7 +75,7 @@ def lockstep(
     """Roll one episode in every environment, all advancing together.
 
     Args:
-        envs: B environments of one kind.
+        envs: B environments of one kind, or a batch of as many as there are seeds.
         act: Maps a TensorDict ``[B]`` with ``observation`` and ``("info", ...)`` of the current
             step to actions ``[B]`` or ``[B, A]``. Rows of finished episodes are asked too and
             their answers ignored.
@@ -53,28 +92,25 @@ def lockstep(
         ValueError: If there are no environments, the numbers of environments and seeds differ, or
             ``max_steps`` is not positive.
     """
-    if not envs:
-        raise ValueError("envs must hold at least one environment, got none")
     if max_steps < 1:
         raise ValueError(f"max_steps must be at least 1, got {max_steps}")
-    if len(envs) != len(seeds):
-        raise ValueError(f"seeds must be one per environment ({len(envs)}), got {len(seeds)}")
-    starts = [env.reset(seed=int(seed)) for env, seed in zip(envs, seeds, strict=True)]
+    batch = _as_batch(envs, seeds)
+    count = len(seeds)
+    starts = batch.reset(seeds)
     observation, info = stack_resets(starts)
     infos = [start[1] for start in starts]
     names = _Names(infos)
-    steps = [env.step for env in envs]
-    alive = np.ones(len(envs), dtype=bool)
+    alive = np.ones(count, dtype=bool)
     frames: list[tuple[Tensor, Tensor, np.ndarray, np.ndarray, dict[str, Tensor]]] = []
     for _ in range(max_steps):
         seen = torch.from_numpy(observation)
-        current = TensorDict({OBSERVATION: seen, INFO: TensorDict(info, len(envs))}, len(envs))
+        current = TensorDict({OBSERVATION: seen, INFO: TensorDict(info, count)}, count)
         action = act(current)
-        commands = action.numpy()
-        reward, mask = np.zeros(len(envs), dtype=np.float32), alive.copy()
+        reward, mask = np.zeros(count, dtype=np.float32), alive.copy()
         observation = observation.copy()
-        for index in mask.nonzero()[0].tolist():
-            outcome = steps[index](commands[index])
+        where = mask.nonzero()[0].tolist()
+        outcomes = batch.step(where, action.numpy())
+        for index, outcome in zip(where, outcomes, strict=True):
             observation[index], reward[index], ended, cut, infos[index] = outcome
             if ended or cut:
                 alive[index] = False
@@ -93,9 +129,19 @@ def lockstep(
                 INFO: {name: _over_time(about, name) for name in names.known},
                 MASK: torch.from_numpy(np.stack(masks, 1)),
             },
-            [len(envs), len(frames)],
+            [count, len(frames)],
         )
     )
+
+
+def _as_batch(envs: Sequence[gymnasium.Env[Any, Any]] | EnvBatch, seeds: Sequence[int]) -> EnvBatch:
+    if not isinstance(envs, Sequence):
+        return envs
+    if not envs:
+        raise ValueError("envs must hold at least one environment, got none")
+    if len(envs) != len(seeds):
+        raise ValueError(f"seeds must be one per environment ({len(envs)}), got {len(seeds)}")
+    return _OwnEnvs(envs)
 
 
 def stack_resets(

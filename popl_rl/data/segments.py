@@ -19,6 +19,7 @@ from popl_rl.data.table_rollouts import Rollouts
 from popl_rl.keys import INFO
 from popl_rl.locks import locked
 from popl_rl.manifest import digest_of_tensors
+from popl_rl.processes import Workers
 from popl_rl.storage import map_tensordict, save_tensordict
 
 __all__ = ["collect_segments", "cut_segments", "segment_buffer", "stored_segments"]
@@ -61,6 +62,7 @@ def collect_segments(
     shares: Mapping[str, float] | None = None,
     max_steps: int = 1000,
     num_envs: int = 64,
+    workers: Workers | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> TensorDict:
     """Collect segments of several behaviours.
@@ -75,6 +77,7 @@ def collect_segments(
         shares: Share of the segments that each behaviour gives, summing to 1; equal if None.
         max_steps: Steps after which an episode is cut.
         num_envs: Environments that advance together.
+        workers: Processes that step them side by side, with the same result; this one if None.
         progress: Called with the number of segments collected so far.
 
     Returns:
@@ -94,7 +97,7 @@ def collect_segments(
     given = _checked_shares(behaviours, shares)
     collected: list[TensorDict] = []
     total, reached = 0, 0.0
-    with Rollouts(make_env) as roll:
+    with Rollouts(make_env, workers) as roll:
         for name, behaviour in behaviours.items():
             reached += given.get(name, 0.0)
             quota = round(reached * num_segments)

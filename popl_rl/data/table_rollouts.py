@@ -15,9 +15,11 @@ from torch import Tensor
 from popl_rl.data.adapters import Native
 from popl_rl.data.behaviours import first_action
 from popl_rl.data.plugged import CheckedEnv
+from popl_rl.data.process_rollouts import RemoteEnvs
 from popl_rl.data.rollouts import MASK, clear_after_end, lockstep, stack_resets
 from popl_rl.data.tables import Table
 from popl_rl.keys import ACTION, INFO, OBSERVATION, REWARD
+from popl_rl.processes import Workers
 
 __all__ = ["Rollouts", "table_lockstep"]
 
@@ -30,6 +32,8 @@ class Rollouts:
 
     Args:
         make_env: Builds one environment.
+        workers: Processes that step environments side by side, of which a table has no need; this
+            one steps them if None.
 
     Attributes:
         env: One of the environments, for its spaces.
@@ -40,11 +44,16 @@ class Rollouts:
         ...     episodes = roll(act, seeds=range(100), max_steps=60)
     """
 
-    def __init__(self, make_env: Callable[[], gymnasium.Env[Any, Any]]) -> None:
+    def __init__(
+        self, make_env: Callable[[], gymnasium.Env[Any, Any]], workers: Workers | None = None
+    ) -> None:
         self._make_env = make_env
         self.env = make_env()
         self._envs = [self.env]
         self.table = _complete_table(self.env)
+        self._remote = None
+        if workers is not None and self.table is None:
+            self._remote = RemoteEnvs(make_env, workers)
 
     def __call__(
         self,
@@ -56,6 +65,8 @@ class Rollouts:
         """Roll one episode from each seed; see ``popl_rl.data.rollouts.lockstep``."""
         if self.table is not None:
             return table_lockstep(self.env, self.table, act, seeds=seeds, max_steps=max_steps)
+        if self._remote is not None:
+            return lockstep(self._remote, act, seeds=seeds, max_steps=max_steps)
         self._envs += [self._make_env() for _ in range(len(seeds) - len(self._envs))]
         return lockstep(self._envs[: len(seeds)], act, seeds=seeds, max_steps=max_steps)
 
@@ -65,6 +76,8 @@ class Rollouts:
     def __exit__(self, *_: object) -> None:
         for env in self._envs:
             env.close()
+        if self._remote is not None:
+            self._remote.close()
 
 
 def table_lockstep(

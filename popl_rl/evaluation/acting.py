@@ -97,6 +97,7 @@ class Rolling:
             max_steps=self.max_steps,
             seed=self.seed,
             greedy=self.greedy,
+            workers=self.world.workers,
             random_action=behaviour
             or random_behaviour(self.world.env.action_space, unbounded=True),
         )

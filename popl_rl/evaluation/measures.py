@@ -14,6 +14,7 @@ from popl_rl.data.table_rollouts import Rollouts
 from popl_rl.keys import ANSWER, INFO, OBSERVATION, PAIR, Answer
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet
+from popl_rl.processes import Workers
 from popl_rl.raters.groups import RaterGroup
 from popl_rl.raters.pairs import PairPool
 from popl_rl.raters.people import Raters
@@ -43,6 +44,7 @@ def roll_out(
     seed: int,
     greedy: bool = False,
     random_action: Callable[[TensorDictBase, torch.Generator], Tensor] | None = None,
+    workers: Workers | None = None,
 ) -> TensorDict:
     """Roll every policy from the same starts, all in lockstep.
 
@@ -55,6 +57,8 @@ def roll_out(
         seed: Seed of the starts and of the sampled actions.
         greedy: Take the most likely actions instead of sampling.
         random_action: A behaviour to roll without policies.
+        workers: Processes that step environments side by side, with the same result; this one if
+            None.
 
     Returns:
         TensorDict ``[P, E, H]`` as from ``popl_rl.data.rollouts.lockstep``; discrete actions are
@@ -86,7 +90,7 @@ def roll_out(
         assert random_action is not None
         return random_action(step, generator)
 
-    roll = Rollouts(make_env)
+    roll = Rollouts(make_env, workers)
     first = first_action(roll.env.action_space)
     # Sets that were saved before their actions were the environment's count them from 0.
     spec = policies.population.spec if isinstance(policies, PolicySet) else None

@@ -32,6 +32,7 @@ from popl_rl.experiments.behaviours import chosen_behaviours, policy_digests, pp
 from popl_rl.experiments.plug_ins import plug_in_digests
 from popl_rl.keys import GROUP, INFO, OBSERVATION
 from popl_rl.manifest import digest_of_tensors
+from popl_rl.processes import Workers
 from popl_rl.randomness import stream
 from popl_rl.raters.collector import collect_preferences
 from popl_rl.raters.groups import RaterGroup, make_groups
@@ -58,8 +59,12 @@ __all__ = [
 Reader = Callable[[Path], tuple[TensorDictBase, TensorDict] | Imported]
 
 
-def build_world(config: EnvConfig) -> World:
+def build_world(config: EnvConfig, *, workers: Workers | None = None) -> World:
     """The environment of a run, see ``popl_rl.data.environments.make_world``.
+
+    Args:
+        config: Settings of the environment.
+        workers: Processes that step it side by side; this one if None.
 
     Raises:
         ValueError: If the environment cannot be resolved or built, ``env.mixture`` names behaviours
@@ -74,6 +79,7 @@ def build_world(config: EnvConfig) -> World:
         data_options=config.data_options,
         mixture=config.mixture,
         choose=partial(chosen_behaviours, config) if is_chosen else None,
+        workers=workers,
     )
 
 
@@ -379,15 +385,15 @@ def _collect(
     generator: torch.Generator,
     progress: Callable[[int], None] | None,
 ) -> TensorDictBase:
+    how: dict[str, Any] = {"generator": generator, "progress": progress, "workers": world.workers}
     if world.collect is not None:
-        return world.collect(config.segments, config.length, generator=generator, progress=progress)
+        return world.collect(config.segments, config.length, **how)
     return collect_segments(
         world.make_for_data,
         world.behaviours,
         num_segments=config.segments,
         length=config.length,
-        generator=generator,
         shares=world.shares,
         max_steps=env.max_steps,
-        progress=progress,
+        **how,
     )

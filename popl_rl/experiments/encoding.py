@@ -7,6 +7,7 @@ from popl_rl.data.readers.imported import Imported
 from popl_rl.data.readers.items import features_as_segments
 from popl_rl.experiments.progress import Progress
 from popl_rl.models.text_features import language_model_features, tfidf_features
+from popl_rl.processes import Workers
 
 __all__ = ["encoded"]
 
@@ -17,6 +18,7 @@ def encoded(
     *,
     pooling: Literal["mean", "last"] = "mean",
     cache: Path | None = None,
+    workers: Workers | None = None,
 ) -> Imported:
     """The same preferences over items with features of their texts.
 
@@ -25,6 +27,7 @@ def encoded(
         encoder: ``"tfidf"``, or the folder of a language model.
         pooling: How a language model's states become one vector.
         cache: Folder in which a language model's features are kept.
+        workers: Processes in which a language model reads; this one if None.
 
     Raises:
         ValueError: If there are no texts, or as the encoders.
@@ -39,6 +42,11 @@ def encoded(
     else:
         with Progress("texts", total=len(set(texts))) as progress:
             features = language_model_features(
-                texts, Path(encoder), pooling=pooling, cache=cache, progress=progress.update
+                texts,
+                Path(encoder),
+                pooling=pooling,
+                cache=cache,
+                workers=workers,
+                progress=progress.update,
             )
     return data._replace(segments=features_as_segments(features))

@@ -1,14 +1,13 @@
 """Jobs in worker processes that wait for each other. One that fails stops only who needs it."""
 
 import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any
+
+from popl_rl.processes import worker_pool
 
 __all__ = ["Job", "run_jobs"]
 
@@ -121,19 +120,4 @@ class _Here(Executor):
 def _pool(workers: int) -> Executor:
     if workers == 0:
         return _Here()
-    # Spawned: a fork of a process that has used torch's threads can hang.
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(workers, mp_context=context, initializer=_begin_worker)
-
-
-def _begin_worker() -> None:
-    """Leave Ctrl-C to the parent, and leave with the parent, even if it is killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_leave_with_parent, daemon=True).start()
-
-
-def _leave_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+    return worker_pool(workers)

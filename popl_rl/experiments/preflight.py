@@ -25,6 +25,7 @@ from popl_rl.experiments.ppo_policies import check_ppo
 from popl_rl.keys import INFO
 from popl_rl.models.sets import load_set
 from popl_rl.plug_ins import located
+from popl_rl.processes import Workers
 from popl_rl.raters.groups import RaterGroup
 from popl_rl.registry import resolve
 
@@ -49,11 +50,12 @@ class Place:
     groups: tuple[RaterGroup, ...]
 
 
-def survey(config: Config) -> Place | None:
+def survey(config: Config, *, workers: Workers | None = None) -> Place | None:
     """Build the world, ask the raters about a random episode, and check what needs them.
 
     Args:
         config: Settings that were checked by themselves.
+        workers: Processes that step the world side by side; this one if None.
 
     Returns:
         The place; None where people's answers are learnt from without simulated raters.
@@ -66,7 +68,7 @@ def survey(config: Config) -> Place | None:
     _check_references(config)
     if not config.raters.groups:
         return None
-    world = build_world(config.env)
+    world = build_world(config.env, workers=workers)
     try:
         groups = build_groups(config.raters, world)
         _check_fit(groups, world.env)

@@ -21,18 +21,22 @@ from popl_rl.experiments.run_sets import load_own_set
 from popl_rl.locks import locked
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.reward_set import RewardSet
+from popl_rl.processes import Workers
 from popl_rl.storage import write_atomic, written_beside
 
 __all__ = ["evaluate_again", "evaluation_title", "new_evaluation"]
 
 
-def evaluate_again(config: Config, run_dir: Path, *, seed: int) -> tuple[Path, Scoreboard]:
+def evaluate_again(
+    config: Config, run_dir: Path, *, seed: int, workers: Workers | None = None
+) -> tuple[Path, Scoreboard]:
     """Evaluate what a run found by these settings.
 
     Args:
         config: The run's settings, with what is to differ in the section ``evaluation``.
         run_dir: Folder of the run, whose segments and preferences are used again.
         seed: Seed of the held-out pairs, new raters and episodes.
+        workers: Processes that step the world side by side; this one if None.
 
     Returns:
         The folder that was written, ``evaluations/<number>``, and the scoreboard.
@@ -47,7 +51,7 @@ def evaluate_again(config: Config, run_dir: Path, *, seed: int) -> tuple[Path, S
     kept, baselines = run_dir / "data", None
     if config.evaluation.baselines and (run_dir / "baselines").is_dir():
         baselines = load_own_set(run_dir, "baselines")
-    world = build_world(config.env)
+    world = build_world(config.env, workers=workers)
     groups = build_groups(config.raters, world)
     load, reader = (kept, None) if kept.is_dir() else given_data(config.data)
     if kept.is_dir():

@@ -22,6 +22,7 @@ from popl_rl.experiments.run_folder import (
 from popl_rl.experiments.run_manifest import load_run_config, write_run_manifest
 from popl_rl.interruption import Terminated
 from popl_rl.memory import keep_freed_memory
+from popl_rl.processes import Workers, workers_for
 
 __all__ = ["kept_unless_refused", "open_run"]
 
@@ -52,11 +53,20 @@ def open_run(
         run_dir = create_run_dir(Path(config.resume), name="", resume=True)
         with in_use(run_dir), _saying_how_to_go_on(run_dir, command):
             config = _continued(config, run_dir, given)
-            place = _prepared(config)
-            write_metadata(run_dir, command=command)
-            yield config, run_dir, place
+            with workers_for(config.workers, threads=config.threads) as workers:
+                place = _prepared(config, workers)
+                write_metadata(run_dir, command=command)
+                yield config, run_dir, place
         return
-    place = _prepared(config)
+    with workers_for(config.workers, threads=config.threads) as workers:
+        place = _prepared(config, workers)
+        with _new_run(config, command) as run_dir:
+            yield config, run_dir, place
+
+
+@contextmanager
+def _new_run(config: Config, command: Sequence[str]) -> Iterator[Path]:
+    """Make the folder of a run, and hold it."""
 
     def fill(folder: Path) -> None:
         write_run_manifest(folder, config)
@@ -67,7 +77,7 @@ def open_run(
     wanted = None if config.run_dir is None else Path(config.run_dir)
     run_dir = create_run_dir(wanted, name=name, fill=fill)
     with in_use(run_dir), _saying_how_to_go_on(run_dir, command):
-        yield config, run_dir, place
+        yield run_dir
 
 
 @contextmanager
@@ -93,12 +103,12 @@ def _continued(config: Config, run_dir: Path, given: Sequence[str]) -> Config:
     return found
 
 
-def _prepared(config: Config) -> Place | None:
+def _prepared(config: Config, workers: Workers | None) -> Place | None:
     """Where the run takes place, after this process was told how it is to compute."""
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # TorchRL sets its own when imported
     torch.set_num_threads(config.threads)
     keep_freed_memory()
-    return survey(config)
+    return survey(config, workers=workers)
 
 
 @contextmanager

@@ -22,6 +22,7 @@ _OURS = (
     "resume",
     "logger",
     "threads",
+    "workers",
     "data.load",
     "data.save",
     "evaluation.baselines_from",

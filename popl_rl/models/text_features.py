@@ -6,7 +6,8 @@ Nothing is downloaded: a model is a folder that is there, as Hugging Face transf
 import hashlib
 import importlib.util
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from popl_rl.locks import locked
 from popl_rl.manifest import read_json
+from popl_rl.processes import Workers
 
 __all__ = ["FeatureCache", "language_model_features", "pool", "tfidf_features"]
 
@@ -72,6 +74,7 @@ def language_model_features(
     longest: int = 512,
     device: str | None = None,
     standardise: bool = True,
+    workers: Workers | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Features:
     """Hidden states of a language model, frozen, of each text.
@@ -89,6 +92,8 @@ def language_model_features(
         longest: Tokens of a text that are read: its last ones with ``"last"``, else its first.
         device: Where to run; a GPU if there is one, with bfloat16, if None.
         standardise: Give each feature mean 0 and standard deviation 1 over the texts.
+        workers: Processes that read batches side by side, each with a model of its own; this one
+            if None. Results are the same to the bit with as many torch threads in each.
         progress: Called with the number of texts done so far.
 
     Returns:
@@ -110,16 +115,48 @@ def language_model_features(
     different = list(dict.fromkeys(texts))
     missing = [text for text in different if text not in kept]
     if missing:
-        model = _Model(folder, pooling, longest, where)
         order = sorted(missing, key=len, reverse=True)  # memory runs out at once or never
+        batches = [order[start : start + batch_size] for start in range(0, len(order), batch_size)]
         done = len(different) - len(missing)
-        for start in range(0, len(order), batch_size):
-            batch = order[start : start + batch_size]
-            kept.add(batch, model(batch))
+        found = _read_batches(batches, (folder, pooling, longest, where), workers)
+        for batch, rows in zip(batches, found, strict=True):
+            kept.add(batch, rows)
+            done += len(batch)
             if progress is not None:
-                progress(done + start + len(batch))
+                progress(done)
     features = np.stack([kept[text] for text in texts])
     return _standard(features) if standardise else features
+
+
+def _read_batches(
+    batches: Sequence[Sequence[str]],
+    model: tuple[Path, Literal["mean", "last"], int, str],
+    workers: Workers | None,
+) -> Iterator[Features]:
+    """Features of each batch in turn, from this process or from workers."""
+    if workers is None:
+        own = _Model(*model)
+        yield from map(own, batches)
+        return
+    asked = [
+        workers.submit(number % len(workers), _read_batch, model, batch)
+        for number, batch in enumerate(batches)
+    ]
+    for reply in asked:
+        yield reply.result()
+
+
+def _read_batch(
+    model: tuple[Path, Literal["mean", "last"], int, str], batch: Sequence[str]
+) -> Features:
+    """Features of a batch in a worker, which loads the model once."""
+    features: Features = _loaded(*model)(batch)
+    return features
+
+
+@cache
+def _loaded(folder: Path, pooling: Literal["mean", "last"], longest: int, device: str) -> "_Model":
+    return _Model(folder, pooling, longest, device)
 
 
 class FeatureCache:

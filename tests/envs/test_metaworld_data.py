@@ -49,6 +49,29 @@ def test_continuations_begin_alike():
         collect_continuations(env, starts=1, length=0, generator=generator)
 
 
+@pytest.mark.parametrize("task", ["drawer-open", "pick-place"])  # whose states look elsewhere
+def test_workers_collect_the_same(task, workers):
+    found = []
+    for where in (None, workers):
+        counts, generator = [], torch.Generator().manual_seed(1)
+        segments = collect_continuations(
+            MetaworldTask(task, terminate=False),
+            starts=3,
+            per_start=2,
+            length=12,
+            starts_per_episode=2,
+            generator=generator,
+            progress=counts.append,
+            workers=where,
+        )
+        assert counts == [2, 4, 6]
+        found.append((segments, generator.get_state()))
+    (alone, state), (together, other) = found
+    assert set(alone.keys(True, True)) == set(together.keys(True, True))
+    assert bool((alone == together).all())
+    assert torch.equal(state, other)
+
+
 def test_a_number_of_segments_that_is_no_multiple_of_the_speeds_is_refused():
     generator = torch.Generator().manual_seed(0)
     with pytest.raises(ValueError, match=r"multiple of the scripted speeds.*got 30 segments and 4"):

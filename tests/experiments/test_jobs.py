@@ -74,10 +74,11 @@ def test_jobs_in_a_circle():
 
 def test_errors_come_back_from_other_processes():
     todo = [Job("fine", 0), Job("fails", -1), Job("late", 0, "fine")]
+    others = set(multiprocessing.active_children())
     assert run_jobs(todo, time.sleep, workers=2) == {
         "fails": "ValueError: sleep length must be non-negative"
     }
-    assert multiprocessing.active_children() == []
+    assert set(multiprocessing.active_children()) <= others
 
 
 def test_a_killed_worker_is_replaced():

@@ -113,6 +113,17 @@ def test_what_is_in_the_cache_is_not_worked_out_again(model_folder, tmp_path, mo
     np.testing.assert_array_equal(first, again)
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_workers_read_the_same(model_folder, tmp_path, workers):
+    options = {"batch_size": 2, "device": "cpu"}
+    done = []
+    alone = language_model_features(TEXTS, model_folder, **options)
+    options |= {"cache": tmp_path, "progress": done.append}
+    together = language_model_features(TEXTS, model_folder, workers=workers, **options)
+    assert np.array_equal(alone, together)
+    assert done == [2, 4, 5]
+
+
 def test_what_is_no_model_is_refused(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="must be the folder of a language model"):
         language_model_features(TEXTS, tmp_path)

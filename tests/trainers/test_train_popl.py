@@ -1,5 +1,6 @@
 import json
 import math
+import multiprocessing
 from dataclasses import replace
 
 import pandas as pd
@@ -7,12 +8,14 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from popl_rl.config import EvaluateConfig
 from popl_rl.evaluation.statistics import RESULT_COLUMNS, read_results
 from popl_rl.models.encoded_policy_set import EncodedPolicySet
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.population import Population
 from popl_rl.randomness import stream
+from popl_rl.trainers import evaluate_policies
 from popl_rl.trainers.train_popl import run, show
 
 MIXTURES = [
@@ -241,6 +244,23 @@ def test_any_gymnasium_environment_with_raters_from_a_file(train, tmp_path):
     groups = set(result.board.results.group) - {"all"}
     assert len(groups) == 2
     assert all(math.isfinite(result.board.value("popl", group, "return")) for group in groups)
+
+
+@pytest.mark.slow  # two runs; test_process_rollouts.py is short
+def test_two_workers_change_no_bit_of_a_run(train, tmp_path):
+    file = tmp_path / "my_raters.py"
+    file.write_text(RATERS)
+    settings = (*GYM, f"raters.groups=['{file}:slow','{file}:upright']")
+    others = set(multiprocessing.active_children())
+    alone, parallel = train(*settings), train(*settings, "workers=2")
+    assert set(multiprocessing.active_children()) <= others
+    for name in ("results.csv", "history.csv", "metrics.csv"):
+        one, other = alone.run_dir / name, parallel.run_dir / name
+        assert one.read_bytes() == other.read_bytes(), name
+    assert equal(alone.policies, parallel.policies)
+    again = EvaluateConfig(run_dir=str(alone.run_dir), seed=0, workers="2")
+    _, board = evaluate_policies.run(again)
+    pd.testing.assert_frame_equal(board.results, alone.board.results)
 
 
 def test_three_doors_and_three_groups(train):
