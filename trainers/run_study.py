@@ -8,7 +8,7 @@ popl-study jailbreaks path/to/data --encode path/to/language-model
 
 The folder holds delivery.npz, or arguments.csv.gz beside arguments_comparisons.csv.gz, or
 dialogues.jsonl.gz beside jailbreaks.jsonl.gz. Further settings are overrides, as of popl-people.
-The same command goes on after a kill; of jailbreaks, features of texts alone are kept.
+The same command goes on after a kill, with the settings that it began with.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from hydra import compose, initialize_config_module
 
 from popl_rl.trainers import import_data, judge_people
-from popl_rl.trainers.command import USER_ERRORS
+from popl_rl.trainers.command import USER_ERRORS, prepare
 from popl_rl.trainers.terminal import steady_terminal
 
 if TYPE_CHECKING:
@@ -76,13 +76,16 @@ def _config(study: str, data: Path, out: Path, settings: Sequence[str]) -> Any:
 
 def _jailbreaks(folder: Path, out: Path, encode: str, settings: Sequence[str]) -> None:
     """Train heads on dialogues, and write and print how they judge."""
-    from popl_rl.config import plain
-    from popl_rl.experiments import jailbreak_study
+    from popl_rl.experiments import jailbreak_study, steps
 
-    config = plain(_config("jailbreaks", folder, out, settings))
-    data = jailbreak_study.read_dialogues(folder, encode, cache=out)
-    rows = jailbreak_study.jailbreak_rows(data, config, methods=tuple(config.people.methods))
-    out.mkdir(parents=True, exist_ok=True)
+    config = prepare(_config("jailbreaks", folder / "dialogues.jsonl.gz", out, settings))
+    is_new = config.resume is None
+    with steps.open_run(config, command=sys.argv) as (config, run_dir, _):
+        with steps.kept_unless_refused(run_dir, is_new=is_new):
+            data = jailbreak_study.read_dialogues(folder, encode, cache=out)
+        methods = tuple(config.people.methods)
+        cells = run_dir / "cells"
+        rows = jailbreak_study.jailbreak_rows(data, config, methods=methods, cells=cells)
     _write_rows("jailbreaks", rows, out)
     shown = rows[~rows["measure"].str.contains("_low|_high")]
     table = shown.pivot_table("value", ["method", "choice"], ["measure", "group"], sort=False)

@@ -14,8 +14,9 @@
   ``preflight``: what is looked at before it
   has a folder; ``reevaluation`` of a finished one.
 - Real people: ``encoding`` of their texts, ``people`` who are held out, ``people_training``,
-  ``people_steps`` of a run, its ``people_report`` and ``people_reevaluation``; ``delivery_study``,
-  ``argument_study`` and ``jailbreak_study``, and ``response_study`` of how people answer.
+  ``people_steps`` of a run, its ``people_report`` and ``people_reevaluation``;
+  ``kept_tables`` of what was done before a kill; ``delivery_study``, ``argument_study`` and
+  ``jailbreak_study``, and ``response_study`` of how people answer.
 - ``markdown`` lays out the tables of all reports, ``tables`` those of the README files, with
   ``wins_table`` and ``table_rows``.
 """

@@ -6,8 +6,9 @@ talked into misbehaving is scored at least as high as the safe one.
 
 import gzip
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +20,15 @@ from torch import Tensor
 
 from popl_rl.algorithms.cpl import GroupCPL, group_weights, train
 from popl_rl.algorithms.dpl import train_dpl
-from popl_rl.algorithms.problem import Problem
 from popl_rl.config import Config
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.evaluation.people_statistics import paired_bootstrap
 from popl_rl.experiments.builders import build_method, build_problem
+from popl_rl.experiments.kept_tables import kept_table
 from popl_rl.experiments.people_training import method_config
 from popl_rl.experiments.progress import Progress
+from popl_rl.manifest import digest_of_bytes
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.models.text_features import language_model_features, tfidf_features
 from popl_rl.randomness import stream
@@ -42,6 +44,7 @@ _FAIR = 0.1  # quantile over the members of a set, as published with POPL
 _STANDARD = ("bradley_terry", "")
 
 Values = npt.NDArray[np.float64]
+Scores = dict[tuple[str, str], Tensor]  # of every reply, by method and choice
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,11 @@ class Dialogues:
 
     def __len__(self) -> int:
         return len(self.objective)
+
+    @property
+    def digest(self) -> str:
+        """Of all that is learnt from."""
+        return digest_of_bytes(self.features.numpy().tobytes() + self.objective.numpy().tobytes())
 
 
 def read_dialogues(folder: Path, encode: str, *, cache: Path | None = None) -> Dialogues:
@@ -123,7 +131,9 @@ def _reduced(raw: npt.NDArray[np.float32], length: Values) -> npt.NDArray[np.flo
     return scaled.astype(np.float32)
 
 
-def jailbreak_rows(data: Dialogues, config: Config, *, methods: tuple[str, ...]) -> pd.DataFrame:
+def jailbreak_rows(
+    data: Dialogues, config: Config, *, methods: tuple[str, ...], cells: Path
+) -> pd.DataFrame:
     """Train every method on every fold, and judge by the pairs that are held out of it.
 
     Of five folds, three are learnt from without the objectives, one is told: its answers by an
@@ -135,6 +145,8 @@ def jailbreak_rows(data: Dialogues, config: Config, *, methods: tuple[str, ...])
         config: Settings of the methods, of the folds (``people.folds``) and the seed.
         methods: Sets to train, besides the standard reward model, heads that are told the
             objectives, and DPL: names of ``configs/method``, or the run's own.
+        cells: Folder in which the scores of each method and fold are kept, so that a study that
+            was killed goes on.
 
     Returns:
         Rows ``method, choice, group, measure, value``: ``accuracy`` by objective, its
@@ -147,18 +159,36 @@ def jailbreak_rows(data: Dialogues, config: Config, *, methods: tuple[str, ...])
     fold[order] = torch.arange(count) % folds
     right: dict[tuple[str, str], Values] = {}
     fooled: dict[tuple[str, str], Values] = {}
-    with Progress("folds", total=folds) as progress:
-        for number in range(folds):
+    learners = ["heads", *_RISK, *methods]
+    cells.mkdir(parents=True, exist_ok=True)
+    with Progress("methods and folds", total=folds * len(learners)) as progress:
+        for place in range(folds * len(learners)):
+            number, name = place // len(learners), learners[place % len(learners)]
             judged, told = fold == number, fold == (number + 1) % folds
-            found = _scores(data, config, methods, number, ~(judged | told), told)
-            for key, score in found:
+            make = partial(_scores, data, config, name, number, ~(judged | told), told)
+            for key, score in _kept(cells / f"{name}-{number}.csv", make, data.digest).items():
                 pass_, jailbreak = _passes(score, count)
-                place = right.setdefault(key, np.zeros(count))
-                place[judged.numpy()] = pass_[judged].numpy()
+                own = right.setdefault(key, np.zeros(count))
+                own[judged.numpy()] = pass_[judged].numpy()
                 total = fooled.setdefault(key, np.zeros(len(jailbreak)))
                 total += jailbreak.numpy() / folds
-            progress.update(number + 1)
+            progress.update(place + 1)
     return _summary(right, fooled, data.objective.numpy())
+
+
+def _kept(path: Path, make: Callable[[], Scores], digest: str) -> Scores:
+    """Scores from a table with a column for each choice, which is made if it is not there."""
+
+    def table() -> pd.DataFrame:
+        return pd.DataFrame({"/".join(key): score.numpy() for key, score in make().items()})
+
+    found = kept_table(path, table, source={"data": digest})
+    # As single precision again: the same bits as those that were written.
+    columns = {str(name): found[name].to_numpy(np.float32) for name in found}
+    return {
+        (name.partition("/")[0], name.partition("/")[2]): torch.from_numpy(value)
+        for name, value in columns.items()
+    }
 
 
 def _passes(scores: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -169,59 +199,58 @@ def _passes(scores: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 def _scores(
-    data: Dialogues,
-    config: Config,
-    methods: tuple[str, ...],
-    number: int,
-    learnt: Tensor,
-    told: Tensor,
-) -> Iterator[tuple[tuple[str, str], Tensor]]:
-    """Score of every reply by each method and choice."""
+    data: Dialogues, config: Config, name: str, number: int, learnt: Tensor, told: Tensor
+) -> Scores:
+    """Score of every reply by a method and each of its choices."""
     size = len(data.features)
     row, action = torch.arange(size).unsqueeze(1), torch.zeros(size, 1, dtype=torch.long)
     bank = SegmentBank(data.features, row, action, False)
     pair = learnt.nonzero()[:, 0]
     said = Comparisons(2 * pair, 2 * pair + 1, torch.arange(len(pair)), len(pair))
-    width = data.features.shape[1]
+    generator = stream(config.seed, f"dialogues/{number}/{name}")
+    if name in _RISK:
+        return _dpl(config, bank, said, name, generator)
+    is_set = name != "heads"
+    settings = method_config(config.method, name) if is_set else config.method
+    settings = replace(settings, cases="preference") if is_set else settings
+    spec = RewardSpec(data.features.shape[1], 1, tuple(settings.hidden))
+    problem = build_problem(settings, spec, bank, said)
+    if not is_set:
+        weight = group_weights(data.objective[pair], len(OBJECTIVES))
+        heads = train(GroupCPL(problem, weight=weight, generator=generator))
+        keys = [_STANDARD, *(("oracle", one) for one in OBJECTIVES)]
+        return dict(zip(keys, problem.scores(heads.population), strict=True))
+    method = build_method(settings, problem, num_groups=2, generator=generator)
+    scores = problem.scores(train(method).population)
+    right = _passes(scores, len(data))[0]
+    found = {}
+    for objective, choice in enumerate(OBJECTIVES):
+        asked = told & (data.objective == objective)
+        found[name, choice] = scores[right[:, asked].mean(1).argmax()]
+    # Members' scores have scales of their own.
+    apart = (scores - scores.mean(1, keepdim=True)) / scores.std(1, keepdim=True).clamp(1e-9)
+    return {**found, (name, "fair"): apart.quantile(_FAIR, dim=0)}
 
-    def generator(name: str) -> torch.Generator:
-        return stream(config.seed, f"dialogues/{number}/{name}")
 
-    def problem_of(settings: Any) -> Problem:
-        return build_problem(settings, RewardSpec(width, 1, tuple(settings.hidden)), bank, said)
-
-    problem = problem_of(config.method)
-    weight = group_weights(data.objective[pair], len(OBJECTIVES))
-    heads = train(GroupCPL(problem, weight=weight, generator=generator("heads")))
-    scores = problem.scores(heads.population)
-    yield from zip([_STANDARD, *(("oracle", one) for one in OBJECTIVES)], scores, strict=True)
+def _dpl(
+    config: Config, bank: SegmentBank, said: Comparisons, kind: str, generator: torch.Generator
+) -> Scores:
+    """Scores by the mean of DPL's distributions, and by a low quantile."""
     recipe = config.method.training
-    for kind, risk in _RISK.items():
-        dpl = train_dpl(
-            bank,
-            said,
-            kind=kind,  # type: ignore[arg-type]
-            hidden=(),
-            steps=recipe.steps,
-            batch_size=recipe.batch_size,
-            learning_rate=recipe.learning_rate,
-            generator=generator(kind),
-        )
-        yield (f"dpl_{kind}", "expectation"), dpl.scores(bank)
-        yield (f"dpl_{kind}", "risk_averse"), dpl.scores(bank, risk=risk)
-    for name in methods:
-        settings = method_config(config.method, name)
-        settings = replace(settings, cases="preference")
-        own = problem_of(settings)
-        method = build_method(settings, own, num_groups=2, generator=generator(name))
-        scores = own.scores(train(method).population)
-        right = _passes(scores, len(data))[0]
-        for objective, choice in enumerate(OBJECTIVES):
-            asked = told & (data.objective == objective)
-            yield (name, choice), scores[right[:, asked].mean(1).argmax()]
-        # Members' scores have scales of their own.
-        apart = (scores - scores.mean(1, keepdim=True)) / scores.std(1, keepdim=True).clamp(1e-9)
-        yield (name, "fair"), apart.quantile(_FAIR, dim=0)
+    dpl = train_dpl(
+        bank,
+        said,
+        kind=kind,  # type: ignore[arg-type]
+        hidden=(),
+        steps=recipe.steps,
+        batch_size=recipe.batch_size,
+        learning_rate=recipe.learning_rate,
+        generator=generator,
+    )
+    return {
+        (f"dpl_{kind}", "expectation"): dpl.scores(bank),
+        (f"dpl_{kind}", "risk_averse"): dpl.scores(bank, risk=_RISK[kind]),
+    }
 
 
 def _summary(

@@ -1,7 +1,6 @@
 """Steps of a run that learns from real people, as ``popl-train`` and ``popl-people`` take them."""
 
 import shutil
-import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -17,6 +16,7 @@ from popl_rl.data.readers.opening import open_data
 from popl_rl.data.readers.summary import summarise
 from popl_rl.data.readers.writing import read_folder, write_folder
 from popl_rl.evaluation.people_statistics import PERSON_COLUMNS, summarise_people
+from popl_rl.experiments.kept_tables import kept_table
 from popl_rl.experiments.loggers import RunLogger
 from popl_rl.experiments.metrics import MetricsWriter
 from popl_rl.experiments.people import Fold, People, people_of, split
@@ -24,9 +24,8 @@ from popl_rl.experiments.people_report import people_alarm, write_people_report
 from popl_rl.experiments.people_training import Trained, fit_ties, judge_fold, train_on
 from popl_rl.experiments.progress import Progress
 from popl_rl.experiments.run_manifest import check_own_data, run_id
-from popl_rl.manifest import digest_of_bytes, read_sealed, sealed
 from popl_rl.models.hypothesis_set import HypothesisSet
-from popl_rl.storage import write_atomic, write_json
+from popl_rl.storage import write_atomic
 
 __all__ = [
     "REFERENCES",
@@ -140,48 +139,31 @@ def compare_methods(
     with Progress("methods and folds", total=len(methods) * len(folds)) as progress:
         for fold in folds:
             for name in methods:
-                path = cells / f"{name}-{fold.number}.csv"
-                if not _is_whole(path):
-                    trained = known(name, fold.number) or train_on(
-                        people, fold, config, name, run=train
-                    )
-                    if trained.found is not None:
-                        shutil.rmtree(path.with_suffix(""), ignore_errors=True)
-                        trained.found.save(path.with_suffix(""))
-                    table = judge_fold(people, fold, trained, config.people, seed=config.seed)
-                    content = table.to_csv(index=False)
-                    write_json(_record(path), sealed({"table": digest_of_bytes(content.encode())}))
-                    write_atomic(path, content)
+                path = cells / f"{name}-{fold.number}"
+                make = partial(_judged, config, people, fold, name, path, known)
                 text = {"choice": "str", "person": "str", "group": "str"}
-                table = pd.read_csv(path, dtype=text, keep_default_na=False)
-                tables.append(table.astype({"accuracy": float, "log_likelihood": float}))
+                number = {"accuracy": float, "log_likelihood": float}
+                file = path.with_suffix(".csv")
+                tables.append(kept_table(file, make, dtype=text | number, keep_default_na=False))
                 done += 1
                 progress.update(done)
     return pd.concat(tables)[PERSON_COLUMNS]
 
 
-def _record(path: Path) -> Path:
-    """File that knows the digest of a table."""
-    return path.with_suffix(".json")
-
-
-def _is_whole(path: Path) -> bool:
-    """Whether there is a table, as it was written; one that was damaged is made again, as is told.
-
-    Tables of earlier versions have no record.
-    """
-    if not path.is_file():
-        return False
-    if not _record(path).exists():
-        return True
-    try:
-        record = read_sealed(_record(path), cure="it is made again")
-        if record.get("table") != digest_of_bytes(path.read_bytes()):
-            raise ValueError(f"{path} was changed after it was written; it is made again")
-    except (OSError, ValueError) as error:
-        warnings.warn(str(error), stacklevel=2)
-        return False
-    return True
+def _judged(
+    config: Config,
+    people: People,
+    fold: Fold,
+    name: str,
+    path: Path,
+    known: Callable[[str, int], Trained | None],
+) -> pd.DataFrame:
+    """How a method that learns from a fold is judged; its set is saved in ``path``."""
+    trained = known(name, fold.number) or train_on(people, fold, config, name, run=train)
+    if trained.found is not None:
+        shutil.rmtree(path, ignore_errors=True)
+        trained.found.save(path)
+    return judge_fold(people, fold, trained, config.people, seed=config.seed)
 
 
 def finish_people(

@@ -147,6 +147,19 @@ def test_a_study_of_jailbreaks(dialogues, tmp_path, capsys):
     assert value["oracle", "helpful", "all", "jailbreaks"] == 1
     assert value["oracle", "harmless", "all", "jailbreaks"] == 0
     assert value["popl", "harmless", "all", "jailbreaks_ratio"] < 0.7
+    # A study that was killed goes on: what is there is kept, and the rest comes out the same.
+    cells = tmp_path / "out" / "comparison" / "cells"
+    times = {path.name: path.stat().st_mtime_ns for path in cells.glob("*.csv")}
+    assert len(times) == 3 * 4
+    (cells / "popl-1.csv").unlink()
+    (tmp_path / "out" / "results.csv").unlink()
+    assert run_study.main(arguments) == 0
+    again = pd.read_csv(tmp_path / "out" / "results.csv", keep_default_na=False)
+    pd.testing.assert_frame_equal(again, rows)
+    written = {
+        path.name for path in cells.glob("*.csv") if path.stat().st_mtime_ns != times[path.name]
+    }
+    assert written == {"popl-1.csv"}
     choices = set(rows[rows["method"] == "dpl_categorical"]["choice"])
     assert choices == {"expectation", "risk_averse"}
     assert "jailbreaks" in capsys.readouterr().out
