@@ -66,24 +66,30 @@ def measure(axis: str, world: str, size: int, out: Path, overrides: list[str]) -
     profile = ["-m", "cProfile", "-o", str(out / "profile")] if axis == "members" else []
     command = [sys.executable, *profile, "-m", "popl_rl.trainers.train_popl", *WORLDS[world]]
     command += [*COMMON, *settings, *overrides, f"run_dir={run_dir}"]
-    with (out / f"{run_dir.name}.log").open("w") as log:
-        child = subprocess.Popen(
-            command, stdout=log, stderr=log, env={**os.environ, "OMP_NUM_THREADS": "1"}
-        )
-        _, status, used = os.wait4(child.pid, 0)
-    child.returncode = os.waitstatus_to_exitcode(status)
-    if child.returncode:
-        raise SystemExit(f"{' '.join(command)} failed, see {log.name}")
+    seconds, gib = taken(command, out / f"{run_dir.name}.log")
     results = pd.read_csv(run_dir / "results.csv", keep_default_na=False)
     own = (results["method"] == "popl") & (results["choice"] == "posterior")
     reached = results[own & (results["measure"] == SHARE[world])]["value"].item()
     row = {
         axis: size,
-        "seconds": used.ru_utime + used.ru_stime,
-        "gib": used.ru_maxrss / 2**20,
+        "seconds": seconds,
+        "gib": gib,
         SHARE[world]: float(reached),
     }
     return row | ({"selection": selection_share(out / "profile")} if profile else {})
+
+
+def taken(command: list[str], log: Path) -> tuple[float, float]:
+    """Processor time in seconds and the most memory in GiB of a process on one thread."""
+    with log.open("w") as file:
+        child = subprocess.Popen(
+            command, stdout=file, stderr=file, env={**os.environ, "OMP_NUM_THREADS": "1"}
+        )
+        _, status, used = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    if child.returncode:
+        raise SystemExit(f"{' '.join(command)} failed, see {log}")
+    return used.ru_utime + used.ru_stime, used.ru_maxrss / 2**20
 
 
 def selection_share(profile: Path) -> float:

@@ -29,6 +29,15 @@ def test_the_interval_is_near_the_normal_one():
     assert (low, high) == pytest.approx((mean - half, mean + half), abs=0.02)
 
 
+def test_of_many_people_the_limit_of_the_bootstrap_is_taken():
+    values = np.random.default_rng(0).exponential(size=5001)
+    ends = [np.array(paired_bootstrap(values[:5000], seed=seed)) for seed in range(8)]
+    error = np.std(ends, axis=0)[1:].mean()
+    limit = np.array(paired_bootstrap(values))
+    assert (limit == paired_bootstrap(values, seed=1)).all()
+    assert np.abs(limit - np.mean(ends, axis=0)).max() < 2 * error
+
+
 def test_one_person_has_no_interval():
     mean, low, high = paired_bootstrap(np.array([0.5]))
     assert mean == 0.5
