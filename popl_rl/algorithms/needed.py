@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from popl_rl.data.comparisons import Comparisons
-from popl_rl.models.preference_likelihood import leave_one_out, per_case
+from popl_rl.models.preference_likelihood import InParts, leave_one_out, per_case
 
 __all__ = [
     "Nested",
@@ -42,7 +42,7 @@ class Nested(NamedTuple):
 
 
 def nested_subsets(
-    likelihood: Tensor, comparisons: Comparisons, *, most: int | None = None
+    likelihood: Tensor | InParts, comparisons: Comparisons, *, most: int | None = None
 ) -> Nested:
     """Add members one after the other, each time the one that helps prediction most.
 
@@ -50,28 +50,38 @@ def nested_subsets(
     catering will do for a new person.
 
     Args:
-        likelihood: Log-likelihood of every comparison under every member, ``[K, M]``; for an honest
-            count of members that were not trained on the rater whose comparison it is.
+        likelihood: Log-likelihood of every comparison under every member, ``[K, M]``, at once or in
+            parts, which are worked out again for each member that enters; for an honest count of
+            members that were not trained on the rater whose comparison it is.
         comparisons: The M comparisons and the case of each.
         most: Size of the largest subset; all K members if None.
 
     Returns:
         The subsets, from the one of a single member on.
     """
-    own = comparisons.per_answer(likelihood)
-    others = per_case(likelihood, comparisons)[:, comparisons.case] - own
+    blocks = InParts.of(likelihood)
+    total = per_case(likelihood, comparisons)
     count = comparisons.sizes().clamp(min=1e-6)
     order: list[int] = []
     values = []
-    strongest = torch.full_like(others[0], -torch.inf)
+    # Of each comparison: what its case's other answers say for the member that they speak for most,
+    # and how likely it is under that member.
+    strongest = torch.full((len(comparisons),), -torch.inf, device=total.device)
     predicted = torch.zeros_like(strongest)
-    rest = list(range(len(likelihood)))
+
+    rest = list(range(blocks.members))
     for _ in range(len(rest) if most is None else min(most, len(rest))):
-        changed = torch.where(others[rest] > strongest, likelihood[rest], predicted)
-        value = per_case(changed, comparisons) / count
+        value = total.new_zeros(len(rest), comparisons.num_cases)
+        for part, some in blocks.blocks(comparisons):
+            others = total[:, comparisons.case[part]] - comparisons.per_answer(some, part)
+            if order:  # the member that has entered last
+                speaks, last = others[order[-1]] > strongest[part], some[order[-1]]
+                predicted[part] = torch.where(speaks, last, predicted[part])
+                strongest[part] = torch.maximum(strongest[part], others[order[-1]])
+            changed = torch.where(others[rest] > strongest[part], some[rest], predicted[part])
+            value.index_add_(1, comparisons.case[part], comparisons.weighted(changed, part))
+        value = value / count
         best = int(value.mean(1).argmax())
-        predicted = changed[best]
-        strongest = torch.maximum(strongest, others[rest[best]])
         order.append(rest.pop(best))
         values.append(value[best])
     return Nested(order, torch.stack(values))

@@ -1,6 +1,7 @@
 """What every method is given, and what every method is: ``Problem`` and ``Method``."""
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal, Protocol
 
 import torch
@@ -14,8 +15,8 @@ from popl_rl.models.calibration import fit_scale
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.policies import Spec
 from popl_rl.models.population import Population
-from popl_rl.models.preference_likelihood import answer_likelihood
-from popl_rl.models.scoring import PassShares, margins, margins_of, pass_shares, segment_scores
+from popl_rl.models.preference_likelihood import InParts, answer_likelihood
+from popl_rl.models.scoring import PassShares, margins_of, pass_shares, segment_scores
 from popl_rl.models.sets import as_set
 from popl_rl.models.style_codes import StyleClone
 from popl_rl.models.style_population import StyledPopulation
@@ -119,9 +120,17 @@ class Problem:
         Returns:
             ``[N, M]``.
         """
-        other = self.conservatism * scores[:, self.comparisons.other]
-        margin = scores[:, self.comparisons.preferred] - other
-        return answer_likelihood(margin, self.comparisons, self.training.slip)
+        return self._likelihood_of(scores, slice(None))
+
+    def likelihood_in_parts(self, scores: Tensor) -> InParts:
+        """As ``likelihood``, of a part of the comparisons at a time."""
+        return InParts(len(scores), partial(self._likelihood_of, scores))
+
+    def _likelihood_of(self, scores: Tensor, part: slice) -> Tensor:
+        comparisons = self.comparisons
+        other = self.conservatism * scores[:, comparisons.other[part]]
+        margin = scores[:, comparisons.preferred[part]] - other
+        return answer_likelihood(margin, comparisons, self.training.slip, part)
 
     def hypothesis_set(self, population: Population) -> HypothesisSet:
         """A population as a set to cater from."""
@@ -129,13 +138,10 @@ class Problem:
 
     def calibrated(self, found: HypothesisSet) -> HypothesisSet:
         """The same set with scores of the scale under which catering predicts answers best."""
-        margin = margins(
-            found.population,
-            self.bank,
-            self.comparisons,
-            alpha=found.alpha,
-            discount=found.discount,
+        scores = segment_scores(
+            found.population, self.bank, alpha=found.alpha, discount=found.discount
         )
+        margin = InParts(len(found), partial(margins_of, scores, self.comparisons))
         found.alpha *= fit_scale(margin, self.comparisons)
         return found
 

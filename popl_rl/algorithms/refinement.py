@@ -19,7 +19,7 @@ from popl_rl.algorithms.problem import Problem
 from popl_rl.config import RefinementSettings
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.population import Population
-from popl_rl.models.preference_likelihood import per_case
+from popl_rl.models.preference_likelihood import InParts, per_case
 
 __all__ = ["refine", "smallest_subset"]
 
@@ -27,14 +27,17 @@ _CUTS = (0.2, 0.4)  # of the steps, after which members that nobody needs are dr
 _LOOKS = 30  # E-steps, one before each block of gradient steps
 
 
-def smallest_subset(likelihood: Tensor, comparisons: Comparisons, *, most: int = 8) -> list[int]:
+def smallest_subset(
+    likelihood: Tensor | InParts, comparisons: Comparisons, *, most: int = 8
+) -> list[int]:
     """As few members as predict the raters as well as more of them do.
 
     Of the `nested_subsets` the smallest within one standard error of the best is taken (Breiman et
     al., 1984): a further member has to earn its place.
 
     Args:
-        likelihood: Log-likelihood of every comparison under every member, ``[N, M]``.
+        likelihood: Log-likelihood of every comparison under every member, ``[N, M]``, at once or in
+            parts.
         comparisons: The M comparisons and the case of each.
         most: Size of the largest subset.
 
@@ -104,13 +107,12 @@ class _CrossFitting:
         order = torch.randperm(comparisons.num_cases, generator=generator, device=device)
         self.fold = order % settings.folds
         self.case = torch.arange(comparisons.num_cases, device=device)
-        self.row = torch.arange(len(comparisons), device=device)
-        self.use = torch.ones(settings.folds + 1, len(comparisons), device=device)
-        self.use[self.fold[comparisons.case], self.row] = 0.0
-        chosen = smallest_subset(self._likelihood(population), comparisons, most=settings.most)
+        self.copy = torch.arange(settings.folds + 1, device=device)
+        likelihood = self._likelihood(population)
+        chosen = smallest_subset(likelihood, comparisons, most=settings.most)
         self.share = torch.full((len(chosen),), 1 / len(chosen), device=device)
+        self.served = torch.ones(len(chosen), comparisons.num_cases, device=device)
         self._train(population.subset(chosen * (settings.folds + 1)))
-        self.weight = torch.ones(len(self.copies), len(comparisons), device=device)
 
     def _train(self, copies: Population) -> None:
         self.copies = copies
@@ -118,19 +120,26 @@ class _CrossFitting:
         rate = self.problem.training.learning_rate
         self.optimizer = torch.optim.Adam(copies.members.parameters(), lr=rate)
 
-    def _likelihood(self, population: Population) -> Tensor:
+    def _likelihood(self, population: Population) -> InParts:
         """Log-likelihood of every comparison under every member, ``[N, M]``."""
-        return self.problem.likelihood(self.problem.scores(population))
+        return self.problem.likelihood_in_parts(self.problem.scores(population))
 
-    def _by_copy(self) -> Tensor:
-        likelihood: Tensor = self._likelihood(self.copies).unflatten(0, (self.folds + 1, -1))
-        return likelihood
+    def _by_copy(self, value: Tensor) -> Tensor:
+        """Values of members ``[N, ...]`` by copy and member."""
+        return value.unflatten(0, (self.folds + 1, -1))  # type: ignore[no-any-return]
 
     def drop(self) -> None:
         """Keep the members that held-out answers need."""
         comparisons = self.problem.comparisons
-        held_out = self._by_copy()[self.fold[comparisons.case], :, self.row].T
-        kept: Sequence[int] = sorted(smallest_subset(held_out, comparisons))
+        likelihood = self._likelihood(self.copies)
+
+        def held_out(part: slice) -> Tensor:
+            case = comparisons.case[part]
+            row = torch.arange(len(case), device=case.device)
+            return self._by_copy(likelihood.part(part))[self.fold[case], :, row].T
+
+        untold = InParts(len(self.share), held_out)
+        kept: Sequence[int] = sorted(smallest_subset(untold, comparisons))
         index = torch.arange(len(self.copies), device=self.share.device)
         index = index.view(self.folds + 1, -1)[:, kept]
         self.share = self.share[kept]
@@ -138,11 +147,16 @@ class _CrossFitting:
 
     def expect(self) -> None:
         """E-step: whom each member serves, told by copies that have not seen the case."""
-        likelihood = per_case(self._by_copy(), self.problem.comparisons)
-        served = expect(likelihood, self.share).responsibility[self.fold, :, self.case].T
-        self.share = served.mean(1)
-        everywhere = served[:, self.problem.comparisons.case]
-        self.weight = (self.use.unsqueeze(1) * everywhere).flatten(0, 1)
+        likelihood = self._by_copy(
+            per_case(self._likelihood(self.copies), self.problem.comparisons)
+        )
+        self.served = expect(likelihood, self.share).responsibility[self.fold, :, self.case].T
+        self.share = self.served.mean(1)
+
+    def _weight(self, case: Tensor) -> Tensor:
+        """How much comparisons of cases ``[B]`` count for each copy of a member, ``[N, B]``."""
+        is_used = (self.fold[case] != self.copy.unsqueeze(1)).float()
+        return (is_used.unsqueeze(1) * self.served[:, case]).flatten(0, 1)
 
     def descend(self, steps: int, *, rate: float) -> None:
         """Gradient steps on batches that all copies share."""
@@ -152,7 +166,7 @@ class _CrossFitting:
         for _ in range(steps):
             index = torch.randint(len(comparisons), shape, generator=self.generator, device=device)
             losses = self.loss.answers(comparisons, index)
-            weight = self.weight[:, index]
+            weight = self._weight(comparisons.case[index])
             if comparisons.weight is not None:
                 weight = weight * comparisons.weight[index]
             loss = (losses * weight).mean(1).sum()

@@ -14,6 +14,9 @@ from popl_rl.keys import ANSWER, CHANCE, PAIR, RANKING, RATER, Answer
 
 __all__ = ["Comparisons", "Grouped"]
 
+_ALL = slice(None)
+_NUMBERS = 2**22  # of members and comparisons that are looked at together
+
 
 class Grouped(NamedTuple):
     """Comparisons in the order of their cases.
@@ -80,9 +83,9 @@ class Comparisons:
         """Whether every case is a single preference, as where nobody kept rater ids."""
         return self.num_cases == len(self)
 
-    def weighted(self, value: Tensor) -> Tensor:
-        """Values of comparisons ``[..., M]`` times how much each counts."""
-        return value if self.weight is None else value * self.weight
+    def weighted(self, value: Tensor, part: slice = _ALL) -> Tensor:
+        """Values of comparisons ``[..., M]``, or of a part of them, times how much each counts."""
+        return value if self.weight is None else value * self.weight[part]
 
     def sizes(self) -> Tensor:
         """Comparisons of each case, by their weights, ``[C]``."""
@@ -131,6 +134,14 @@ class Comparisons:
         """Slices of at most ``size`` comparisons, all of them one after the other."""
         for start in range(0, len(self), size):
             yield slice(start, min(start + size, len(self)))
+
+    def answer_blocks(self, members: int) -> Iterator[slice]:
+        """Slices so small that a number for each of some members and comparisons takes 16 MB.
+
+        Comparisons of one answer stay together: where there are such, all are in one slice.
+        """
+        alone = self.answer is None and self.stage is None
+        return self.blocks(max(1, _NUMBERS // members) if alone else max(1, len(self)))
 
     @classmethod
     def from_preferences(
@@ -233,9 +244,14 @@ class Comparisons:
         }
         return replace(self, **tensors)  # type: ignore[arg-type]
 
-    def per_answer(self, value: Tensor) -> Tensor:
-        """Weighted sums over the comparisons of the same answer, at each of them, ``[..., M]``."""
-        value = self.weighted(value)
+    def per_answer(self, value: Tensor, part: slice = _ALL) -> Tensor:
+        """Weighted sums over the comparisons of the same answer, at each of them, ``[..., M]``.
+
+        Args:
+            value: Of all comparisons, or of a part.
+            part: One of ``answer_blocks``.
+        """
+        value = self.weighted(value, part)
         if self.answer is None:
             return value
         total = value.new_zeros(*value.shape[:-1], int(self.answer.max()) + 1)

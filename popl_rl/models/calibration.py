@@ -4,7 +4,12 @@ import torch
 from torch import Tensor
 
 from popl_rl.data.comparisons import Comparisons
-from popl_rl.models.preference_likelihood import MISTAKE, answer_likelihood, leave_one_out
+from popl_rl.models.preference_likelihood import (
+    MISTAKE,
+    InParts,
+    answer_likelihood,
+    leave_one_out,
+)
 
 __all__ = ["MISTAKES", "SCALES", "fit_response", "fit_scale"]
 
@@ -17,7 +22,9 @@ MISTAKES = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 _COARSE = tuple(2.0**power for power in range(-5, 3))  # for raters not learnt of
 
 
-def fit_scale(margin: Tensor, comparisons: Comparisons, *, mistake: float = MISTAKE) -> float:
+def fit_scale(
+    margin: Tensor | InParts, comparisons: Comparisons, *, mistake: float = MISTAKE
+) -> float:
     """Scale of the margins under which catering predicts raters' answers best.
 
     Members are trained with scores of some scale, but what a rater's answers tell of two members
@@ -27,7 +34,7 @@ def fit_scale(margin: Tensor, comparisons: Comparisons, *, mistake: float = MIST
     answers speak for, and the likelihood of all answers is maximised over ``SCALES``.
 
     Args:
-        margin: Margins of the N members on M comparisons, ``[N, M]``.
+        margin: Margins of the N members on M comparisons, ``[N, M]``, at once or in parts.
         comparisons: The comparisons, a case for each rater.
         mistake: Chance that an answer is a slip, in [0, 0.5), as in catering.
 
@@ -38,10 +45,11 @@ def fit_scale(margin: Tensor, comparisons: Comparisons, *, mistake: float = MIST
     Raises:
         ValueError: If ``mistake`` is outside [0, 0.5).
     """
-    if len(margin) == 1 or comparisons.num_cases == len(comparisons):
+    margin = InParts.of(margin)
+    if margin.members == 1 or comparisons.num_cases == len(comparisons):
         return 1.0
     values = [
-        leave_one_out(answer_likelihood(scale * margin, comparisons, mistake), comparisons).mean()
+        leave_one_out(_scaled(margin, scale, comparisons, mistake), comparisons).mean()
         for scale in SCALES
     ]
     return SCALES[int(torch.stack(values).argmax())]
@@ -68,12 +76,22 @@ def fit_response(
     Raises:
         ValueError: If ``mistake`` is outside [0, 0.5).
     """
+    parts = InParts.of(margin)
 
     def value(scale: float, slip: float) -> float:
-        likelihood = answer_likelihood(scale * margin, comparisons, slip)
+        likelihood = _scaled(parts, scale, comparisons, slip)
         return float(leave_one_out(likelihood, comparisons).mean())
 
     scale = max(_COARSE, key=lambda one: value(one, MISTAKE if mistake is None else mistake))
     slip = max(MISTAKES, key=lambda one: value(scale, one)) if mistake is None else mistake
     near = (scale / 2, scale / 2**0.5, scale, scale * 2**0.5, scale * 2)
     return max(near, key=lambda one: value(one, slip)), slip
+
+
+def _scaled(margin: InParts, scale: float, comparisons: Comparisons, mistake: float) -> InParts:
+    """Likelihood of answers with margins that are multiplied by a factor."""
+
+    def likelihood(part: slice) -> Tensor:
+        return answer_likelihood(scale * margin.part(part), comparisons, mistake, part)
+
+    return InParts(margin.members, likelihood)

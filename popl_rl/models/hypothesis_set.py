@@ -1,10 +1,10 @@
 """The result of training: a set of hypotheses, and choosing from it for one person or for all."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import ClassVar, Literal, Self, cast
+from typing import Any, ClassVar, Literal, Self, cast
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
@@ -27,7 +27,7 @@ from popl_rl.models.questions import (
     best_question,
 )
 from popl_rl.models.reward_functions import RewardSpec
-from popl_rl.models.scoring import case_values, margins
+from popl_rl.models.scoring import margins_of, pass_shares, segment_scores
 from popl_rl.models.set_files import VERSION, read_about, read_population, write_set
 from popl_rl.selection.lexicase import lexicase_selection
 
@@ -78,10 +78,13 @@ class HypothesisSet:
 
     def distinct(self, bank: SegmentBank, comparisons: Comparisons) -> Self:
         """Keep one member for each distinct row of passes ``[M]``, the first with that row."""
-        passes = self.margins(bank, comparisons) > 0
-        inverse = torch.unique(passes, dim=0, return_inverse=True)[1].tolist()
-        first = sorted({behaviour: inverse.index(behaviour) for behaviour in inverse}.values())
-        return self.subset(first)
+        # Members are told apart by the comparisons so far, then by some more.
+        number = torch.zeros(len(self), 1, dtype=torch.int32, device=self.population.device)
+        for margin in self._margins_in_parts(bank, comparisons):
+            seen = torch.cat([number, (margin > 0).int()], 1)
+            number = torch.unique(seen, dim=0, return_inverse=True)[1].int().unsqueeze(1)
+        inverse = number.flatten().tolist()
+        return self.subset(sorted({inverse.index(behaviour) for behaviour in inverse}))
 
     def __len__(self) -> int:
         return len(self.population)
@@ -93,8 +96,11 @@ class HypothesisSet:
         p_i Z_ij p_j`` with equal shares p; two members are as similar as the agreement of their
         passes exceeds chance, ``Z = max(0, 2 agreement - 1)``.
         """
-        sign = (self.margins(bank, comparisons) > 0).float() * 2 - 1
-        similarity = (sign @ sign.T / sign.shape[1]).clamp(min=0)
+        together = torch.zeros(len(self), len(self), device=self.population.device)
+        for margin in self._margins_in_parts(bank, comparisons):
+            sign = (margin > 0).float() * 2 - 1
+            together += sign @ sign.T
+        similarity = (together / len(comparisons)).clamp(min=0)
         return float(1 / similarity.mean())
 
     @staticmethod
@@ -104,6 +110,20 @@ class HypothesisSet:
 
     def margins(self, segments: TensorDictBase | SegmentBank, comparisons: Comparisons) -> Tensor:
         """Margins of every hypothesis on every comparison, ``[N, M]``; positive is a pass."""
+        return margins_of(*self._scores(segments, comparisons))
+
+    def _margins_in_parts(
+        self, segments: TensorDictBase | SegmentBank, comparisons: Comparisons
+    ) -> Iterator[Tensor]:
+        """As ``margins``, some comparisons after the other, ``[N, B]``."""
+        scores, comparisons = self._scores(segments, comparisons)
+        for part in comparisons.answer_blocks(len(self)):
+            yield margins_of(scores, comparisons, part)
+
+    def _scores(
+        self, segments: TensorDictBase | SegmentBank, comparisons: Comparisons
+    ) -> tuple[Tensor, Comparisons]:
+        """Scores of segments ``[N, segments]``, and the comparisons by their numbers in these."""
         bank = segments if isinstance(segments, SegmentBank) else self._bank(segments)
         pair = torch.stack([comparisons.preferred, comparisons.other])
         if pair.numel() < len(bank):
@@ -112,13 +132,8 @@ class HypothesisSet:
             bank = bank.subset(used)
             comparisons = replace(comparisons, preferred=pair[0], other=pair[1])
         device = self.population.device
-        return margins(
-            self.population,
-            bank.to(device),
-            comparisons.to(device),
-            alpha=self.alpha,
-            discount=self.discount,
-        )
+        how: dict[str, Any] = {"alpha": self.alpha, "discount": self.discount}
+        return segment_scores(self.population, bank.to(device), **how), comparisons.to(device)
 
     def cater(
         self,
@@ -272,7 +287,8 @@ class HypothesisSet:
         quantile: float = 0.1,
     ) -> int:
         """As ``fair``, from comparisons; the most accurate one where nobody's are known by id."""
-        values = case_values(self.margins(segments, comparisons).cpu() > 0, comparisons)
+        scores, comparisons = self._scores(segments, comparisons)
+        values = pass_shares(scores, comparisons).values.cpu()
         if comparisons.is_single:
             return int(values.mean(1).argmax())
         # One after the other: torch refuses the quantiles of more than 16 million values at once.

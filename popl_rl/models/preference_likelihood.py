@@ -5,6 +5,7 @@ ranking under that of Plackett (1975) and Luce (1959).
 """
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import torch
@@ -16,6 +17,7 @@ from popl_rl.data.comparisons import Comparisons
 
 __all__ = [
     "MISTAKE",
+    "InParts",
     "answer_likelihood",
     "drawn_likelihood",
     "fit_threshold",
@@ -59,7 +61,12 @@ def _with_slips(right: Tensor, wrong: Tensor, mistake: float) -> Tensor:
     return torch.logaddexp(chance[0] + right, chance[1] + wrong)
 
 
-def answer_likelihood(margin: Tensor, comparisons: Comparisons, mistake: float = MISTAKE) -> Tensor:
+def answer_likelihood(
+    margin: Tensor,
+    comparisons: Comparisons,
+    mistake: float = MISTAKE,
+    part: slice = slice(None),
+) -> Tensor:
     """Log-likelihood of the answers that comparisons are of, at each of these.
 
     Sums over comparisons by their weights are those over answers: a stage of J comparisons stands
@@ -77,6 +84,7 @@ def answer_likelihood(margin: Tensor, comparisons: Comparisons, mistake: float =
         margin: Margins of the comparisons in the eyes of N members, ``[N, M]``.
         comparisons: The M comparisons.
         mistake: Chance of a slip, in [0, 0.5).
+        part: Whose margins these are, one of ``Comparisons.answer_blocks``; all of them otherwise.
 
     Returns:
         ``[N, M]``.
@@ -85,7 +93,8 @@ def answer_likelihood(margin: Tensor, comparisons: Comparisons, mistake: float =
         ValueError: If ``mistake`` is outside [0, 0.5).
     """
     if comparisons.stage is None:
-        return _of_draws(margin, comparisons.tied, comparisons.threshold, mistake)
+        tied = None if comparisons.tied is None else comparisons.tied[part]
+        return _of_draws(margin, tied, comparisons.threshold, mistake)
     size = comparisons.stage.bincount()
     stage = comparisons.stage.expand(margin.shape)
     most = margin.new_full((*margin.shape[:-1], len(size)), -torch.inf)
@@ -151,13 +160,51 @@ def fit_threshold(margin: Tensor, comparisons: Comparisons, mistake: float = MIS
     return float(minimize_scalar(cost, bounds=_THRESHOLDS, method="bounded").x)
 
 
-def per_case(value: Tensor, comparisons: Comparisons) -> Tensor:
+class InParts:
+    """Values of K members on M comparisons, of which a part is worked out at a time.
+
+    So memory does not grow with the comparisons: all at once are ``[K, M]``.
+
+    Args:
+        members: How many members K.
+        part: Maps a slice of the comparisons, one of ``Comparisons.answer_blocks``, to ``[K, B]``.
+    """
+
+    def __init__(self, members: int, part: Callable[[slice], Tensor]) -> None:
+        self.members, self.part = members, part
+        self._whole: Tensor | None = None
+
+    @classmethod
+    def of(cls, whole: "Tensor | InParts") -> "InParts":
+        """One that is worked out already, ``[K, M]``, in parts."""
+        if isinstance(whole, InParts):
+            return whole
+        return cls(len(whole), lambda part: whole[:, part])
+
+    def blocks(self, comparisons: Comparisons) -> Iterator[tuple[slice, Tensor]]:
+        """Parts of all comparisons, one after the other; a single one is worked out once."""
+        parts = list(comparisons.answer_blocks(self.members))
+        if len(parts) == 1:
+            if self._whole is None:
+                self._whole = self.part(parts[0])
+            yield parts[0], self._whole
+            return
+        for part in parts:
+            yield part, self.part(part)
+
+
+def per_case(value: Tensor | InParts, comparisons: Comparisons) -> Tensor:
     """Sums over the comparisons of each case, by their weights, ``[..., M] -> [..., C]``."""
-    total = value.new_zeros(*value.shape[:-1], comparisons.num_cases)
-    return total.index_add_(-1, comparisons.case, comparisons.weighted(value))
+    if isinstance(value, Tensor):
+        total = value.new_zeros(*value.shape[:-1], comparisons.num_cases)
+        return total.index_add_(-1, comparisons.case, comparisons.weighted(value))
+    total = torch.zeros(value.members, comparisons.num_cases, device=comparisons.case.device)
+    for part, some in value.blocks(comparisons):
+        total.index_add_(-1, comparisons.case[part], comparisons.weighted(some, part))
+    return total
 
 
-def leave_one_out(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
+def leave_one_out(likelihood: Tensor | InParts, comparisons: Comparisons) -> Tensor:
     """Likelihood of each answer under the member that its case's other answers speak for.
 
     Args:
@@ -167,6 +214,10 @@ def leave_one_out(likelihood: Tensor, comparisons: Comparisons) -> Tensor:
     Returns:
         Log-likelihood of each comparison under that member, ``[M]``.
     """
-    own = comparisons.per_answer(likelihood)
-    others = per_case(likelihood, comparisons)[:, comparisons.case] - own
-    return likelihood.gather(0, others.argmax(0, keepdim=True))[0]
+    blocks = InParts.of(likelihood)
+    total = per_case(likelihood, comparisons)
+    found = []
+    for part, some in blocks.blocks(comparisons):
+        others = total[:, comparisons.case[part]] - comparisons.per_answer(some, part)
+        found.append(some.gather(0, others.argmax(0, keepdim=True))[0])
+    return torch.cat(found)

@@ -142,7 +142,7 @@ def test_fairness_by_hand(monkeypatch, two, steps, quantile, fairest):
     one answer of each: every quantile is 1/2. The medians are 1 and 1/2.
     """
     margin = torch.tensor([[1.0] * 6 + [-1.0] * 2, [1.0, -1.0] * 4])
-    monkeypatch.setattr("popl_rl.models.hypothesis_set.margins", lambda *_, **__: margin)
+    monkeypatch.setattr("popl_rl.models.scoring.margins_of", lambda *_: margin)
     raters = [0, 0, 1, 1, 2, 2, 3, 3]
     assert two.fair(steps, answers(*[FIRST] * 8, raters=raters), quantile=quantile) == fairest
 
@@ -177,9 +177,10 @@ def test_effective_number_by_hand(monkeypatch, steps, signs, expected):
     3/4: similarity 1/2, mean (1 + 1 + 1/2 + 1/2) / 4. Two alike and one opposite: (3 + 2) / 9.
     """
     margin = torch.tensor(signs, dtype=torch.float)
-    monkeypatch.setattr("popl_rl.models.hypothesis_set.margins", lambda *_, **__: margin)
+    monkeypatch.setattr("popl_rl.models.hypothesis_set.margins_of", lambda *_: margin)
     policies = PolicySet(linear_policies(*[[0.0, 0.0]] * len(signs)))
-    comparisons = Comparisons(torch.tensor([0]), torch.tensor([1]), torch.tensor([0]), 1)
+    first = torch.zeros(4, dtype=torch.long)
+    comparisons = Comparisons(first, first + 1, first, 1)
     number = policies.effective_number(SegmentBank.from_segments(steps), comparisons)
     assert number == pytest.approx(expected)
 
@@ -187,7 +188,7 @@ def test_effective_number_by_hand(monkeypatch, steps, signs, expected):
 def test_distinct_members_by_hand(monkeypatch, bank, comparisons, generator):
     """Passes of the four members: (yes, no), (yes, no), (no, yes), (yes, no); 0 and 2 stay."""
     margin = torch.tensor([[1.0, -1.0], [1.0, 0.0], [-1.0, 1.0], [2.0, -0.5]])
-    monkeypatch.setattr("popl_rl.models.hypothesis_set.margins", lambda *_, **__: margin)
+    monkeypatch.setattr("popl_rl.models.hypothesis_set.margins_of", lambda *_: margin)
     population = Population.create(PolicySpec(5, 2, True, ()), 4, generator=generator)
     policies = PolicySet(population, alpha=0.3, discount=0.9).distinct(bank, comparisons)
     assert policies.origin == [0, 2]
