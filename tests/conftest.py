@@ -43,6 +43,7 @@ TINY = [
     "evaluation.new_raters=2",
     "evaluation.curve=[1,5]",
     "evaluation.pairs=200",
+    "evaluation.learning_curve=0",
     "logger=csv",
 ]
 

@@ -37,11 +37,13 @@ class Result:
         run_dir: Folder of the run.
         policies: The set that was found.
         board: What it is worth to every group.
+        missing: Says how many answers are missing, if any are.
     """
 
     run_dir: Path
     policies: "HypothesisSet"
     board: "Scoreboard"
+    missing: str | None = None
 
 
 def run(config: Config) -> Result:
@@ -64,6 +66,7 @@ def run(config: Config) -> Result:
 def _run_groups(config: Config, run_dir: Path, place: "Place", *, is_new: bool) -> Result:
     """Learn from simulated raters of hidden groups, and judge by what each group gets."""
     from popl_rl.experiments import steps
+    from popl_rl.experiments.learning_curve import missing_answers
 
     # 1. World, raters, and what they say; the population to start from.
     with steps.kept_unless_refused(run_dir, is_new=is_new):
@@ -79,12 +82,14 @@ def _run_groups(config: Config, run_dir: Path, place: "Place", *, is_new: bool) 
 
         # 4. Evaluated for every hidden group; told in a table, in pictures and in words.
         board = steps.evaluate(config, setting, found, references, run_dir)
+        missing = missing_answers(config, setting, found, run_dir)
         about = steps.describe(config, setting, found, board)
+        about |= {} if missing is None else {"answers": missing}
         steps.write_report(config, board, about, {}, run_dir)
         figures = steps.draw(config, setting, found, references, board, run_dir)
         steps.write_report(config, board, about, figures, run_dir)
         steps.log_results(logger, board, figures, method.generations)
-    return Result(run_dir, found, board)
+    return Result(run_dir, found, board, missing)
 
 
 def _run_people(config: Config, run_dir: Path, *, is_new: bool) -> Result:
@@ -138,6 +143,10 @@ def show(result: Result) -> None:
 
     console = Console()
     print_results(console, result.board.results, result.board.label)
+    if result.missing is not None:
+        console.print(
+            f"warning: {result.missing}", style="bold red", highlight=False, soft_wrap=True
+        )
     console.print(f"report, pictures, policies and logs: {result.run_dir}", soft_wrap=True)
 
 

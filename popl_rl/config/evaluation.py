@@ -33,6 +33,9 @@ class EvaluationConfig:
     brex_steps: int = 10_000  # steps of B-REX's chain
     dpl_steps: int = 500  # steps of DPL's training
     animate: bool = False  # an animated GIF for each group, where there is a renderer
+    # Comparisons up to which the method is trained on fewer answers too, to tell how many are
+    # missing; 0 for never.
+    learning_curve: int = 1000
     history: int = 10  # generations between two snapshots for the pictures; 0 for none
 
     def check(self, at: Checker) -> None:
@@ -44,7 +47,7 @@ class EvaluationConfig:
         at.expect(self.menu <= 10**6, "menu", "at most 1e+06", self.menu)
         at.one_of(self, "optimiser", ("auto", "plan", "ppo"))
         at.one_of(self, "reference", ("random", "clone", "others"))
-        at.not_negative(self, "history")
+        at.not_negative(self, "history", "learning_curve")
         if self.baselines_from is not None:
             expected = "the folder 'baselines' of an earlier run"
             # Each kind of set says what it is in a file of such a name.

@@ -6,7 +6,7 @@
   ``best_of_set`` and its worth in ``hindsight``, ``held_out_raters``, ``unexplained_raters``,
   ``guarantees`` and ``ranking_agreement``; by the number of answers, to drawn or to
   ``chosen_questions``, in ``catering_curves``; ``references``: what the data's behaviours and the
-  optimum are worth.
+  optimum are worth; by the number of answers learnt from, in ``learning_curves``.
 - Real people: ``people`` who are held out, ``people_models`` of each of them, and
   ``people_statistics``.
 - What is told: ``evaluator`` fills the ``results`` of a run by a ``protocol``, ``diagnostics`` puts

@@ -12,7 +12,7 @@
   ``benchmark_report`` tell the results; ``guarantees`` counts what its sets guarantee.
 - ``steps``: the steps of a training run, in their order, of which ``run_start`` is the first;
   ``preflight``: what is looked at before it
-  has a folder; ``reevaluation`` of a finished one.
+  has a folder; ``learning_curve``: what fewer answers teach; ``reevaluation`` of a finished one.
 - Real people: ``encoding`` of their texts, ``people`` who are held out, ``people_training``,
   ``people_steps`` of a run, its ``people_report`` and ``people_reevaluation``;
   ``kept_tables`` of what was done before a kill; ``delivery_study``, ``argument_study`` and

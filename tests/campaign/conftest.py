@@ -41,6 +41,7 @@ TINY = [
     "evaluation.curve_members=2",
     "evaluation.pairs=40",
     "evaluation.history=0",
+    "evaluation.learning_curve=0",
     "logger=csv",
 ]
 

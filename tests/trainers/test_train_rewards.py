@@ -27,6 +27,7 @@ STATELESS = [
     "evaluation.pairs=200",
     "evaluation.brex_steps=100",
     "evaluation.dpl_steps=20",
+    "evaluation.learning_curve=0",
     "logger=csv",
 ]
 
