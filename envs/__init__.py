@@ -5,5 +5,6 @@
 * ``delivery``: a grid read from a file, on which real people have compared segments.
 * ``cartpole``: Gymnasium's CartPole, the smallest continuous world.
 * ``reacher``: MuJoCo's Reacher, quick or smooth.
+* ``hopper``: MuJoCo's Hopper, fast or upright.
 * ``metaworld_tasks``: a robot arm at fifty tasks.
 """

@@ -4,7 +4,7 @@
   ``ppo`` trains policies on reward functions, with episodes from ``ppo_episodes``.
 - What that is worth: ``measures`` of episodes and rankings, ``optimum`` with exact returns,
   ``best_of_set`` and its worth in ``hindsight``, ``held_out_raters``, ``unexplained_raters``,
-  ``guarantees`` and ``ranking_agreement``; by the number of answers, to drawn or to
+  ``guarantees``, ``ranking_agreement`` and ``left_data``; by the number of answers, to drawn or to
   ``chosen_questions``, in ``catering_curves``; ``references``: what the data's behaviours and the
   optimum are worth; by the number of answers learnt from, in ``learning_curves``.
 - Real people: ``people`` who are held out, ``people_models`` of each of them, and

@@ -9,9 +9,10 @@ from popl_rl.evaluation.results import Scoreboard
 from popl_rl.keys import OBSERVATION
 from popl_rl.raters.condorcet import find_cycle, majority_preference
 
-__all__ = ["alarm", "diagnostics", "unexplained", "weak_oracles"]
+__all__ = ["alarm", "diagnostics", "left_data", "unexplained", "weak_oracles"]
 
 _WEAK = 0.8  # share of the optimum below which an oracle is no measure of others
+_INSIDE = 0.8  # share of a policy's steps inside the data below which it has left them
 _ITEMS = 150  # of which three are looked for that a majority prefers in a circle
 
 
@@ -24,11 +25,11 @@ def diagnostics(board: Scoreboard, evaluator: Evaluator) -> dict[str, str]:
 
     Returns:
         Sentences by what they are about: ``new raters' further answers``, how well they are met;
-        ``alarm`` and ``unexplained raters``, see ``alarm`` and ``unexplained``; ``oracle``, if one
-        is far from the optimum of its group; ``collapse``, if groups were given the same
-        hypothesis; ``hidden context``, DPL's detector, if it ran; ``majority``, if the groups,
-        pooled in equal shares, prefer states in a circle, so that no single utility can say what
-        they want.
+        ``alarm`` and ``unexplained raters``, see ``alarm`` and ``unexplained``; ``data``, see
+        ``left_data``; ``oracle``, if one is far from the optimum of its group; ``collapse``, if
+        groups were given the same hypothesis; ``hidden context``, DPL's detector, if it ran;
+        ``majority``, if the groups, pooled in equal shares, prefer states in a circle, so that no
+        single utility can say what they want.
     """
     said = {}
     row = _row_of(board.results)
@@ -43,6 +44,9 @@ def diagnostics(board: Scoreboard, evaluator: Evaluator) -> dict[str, str]:
     lost = unexplained(board.results)
     if lost is not None:
         said["unexplained raters"] = lost
+    left = left_data(board.results)
+    if left is not None:
+        said["data"] = left
     weak = weak_oracles(board.results)
     if weak is not None:
         said["oracle"] = weak
@@ -108,6 +112,28 @@ def unexplained(results: pd.DataFrame) -> str | None:
         f"first answers choose ranks {row['unexplained_accuracy']:.0%} of their further answers "
         f"right, and {row['typical_accuracy']:.0%} of the typical rater's; a group may be lost, "
         "which more raters, more answers or more members (method=popl_niches) may find"
+    )
+
+
+def left_data(results: pd.DataFrame) -> str | None:
+    """Say so if policies that groups are given have left the data, see ``DataRegion``.
+
+    Args:
+        results: Rows of a scoreboard.
+
+    Returns:
+        A sentence, or None if at least 0.8 of each policy's steps are inside the data, or nothing
+        was measured of them.
+    """
+    inside = results[results.measure == "inside_data"]
+    gone = inside[inside.value < _INSIDE]
+    if gone.empty:
+        return None
+    each = ", ".join(f"{row.value:.0%} for {row.group}" for row in gone.itertuples())
+    return (
+        f"policies leave the data: as near to the data as 95% of held-out data are {each} of their "
+        "steps; if they fall or stand still, try method.training.bc=0.3 or 1, a lower "
+        "method.training.conservatism, or style codes (method.evolve=code)"
     )
 
 

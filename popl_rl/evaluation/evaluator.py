@@ -42,6 +42,7 @@ from popl_rl.evaluation.catering_curves import score_curves
 from popl_rl.evaluation.chosen_questions import ask_new_raters
 from popl_rl.evaluation.held_out_raters import draw_held_out_raters, favourites, gain
 from popl_rl.evaluation.hindsight import score_hindsight
+from popl_rl.evaluation.left_data import score_region
 from popl_rl.evaluation.measures import (
     group_accuracy,
     group_returns,
@@ -231,6 +232,8 @@ class Evaluator:
             place = int(served.share(index, served.picks["posterior"]).argmax())
             catered[group.name] = served.members[place]
             episodes[label, group.name] = served.performance.one(place).episodes
+        if isinstance(hypotheses, PolicySet):
+            score_region(rows, label, self.bank, list(episodes.values()), seed=self.seed)
         if reward_baselines is not None:
             brex = self._serve(reward_baselines.brex, "brex", rows, curve=[])
             self._score_as_a_whole(reward_baselines.brex, "brex", rows, brex, pooled_scores)

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from popl_rl.evaluation.diagnostics import alarm, unexplained
+from popl_rl.evaluation.diagnostics import alarm, left_data, unexplained
 from popl_rl.evaluation.method_names import method_name
 from popl_rl.evaluation.statistics import (
     HEADLINES,
@@ -113,7 +113,7 @@ def print_results(console: Console, results: pd.DataFrame, label: str) -> None:
     for line in [] if of_people else verdict_lines(results, label):
         console.print(line, soft_wrap=True)
     console.print(people_table(results) if of_people else results_table(results))
-    warnings = [alarm(results), unexplained(results)]
+    warnings = [alarm(results), unexplained(results), left_data(results)]
     if of_people:
         warnings = [people_alarm(results, label)]
     for warning in filter(None, warnings):
