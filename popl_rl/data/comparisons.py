@@ -163,6 +163,8 @@ class Comparisons:
                 same, but ties are answers of a model of draws, whose threshold is at first the
                 likeliest of somebody who finds everything equally good.
 
+        Beside rankings, ties are left out whatever ``ties`` says.
+
         Returns:
             The M' strict ones, each with its case; raters' cases are numbered from 0. Without
             raters, a ranking is a case.
@@ -176,7 +178,7 @@ class Comparisons:
         answer = preferences[ANSWER]
         _check_answers(answer)
         ranking = _rankings(preferences)
-        counting = ties != "drop" and cases == "rater"
+        counting = ties != "drop" and cases == "rater" and ranking is None
         kept = answer <= (Answer.TIE if counting else Answer.SECOND)
         if not (answer <= Answer.SECOND).any():
             raise ValueError(

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
 from popl_rl.algorithms.cpl import GroupCPL, group_weights, train
 from popl_rl.algorithms.plugged import checked_method
@@ -192,8 +193,8 @@ def train_baselines(
     Args:
         config: What to load, if anything.
         problem: What the method was given, with the recipe that these are trained by too.
-        preferences: With the hidden groups, which oracles are told; the strict ones are the
-            problem's comparisons.
+        preferences: With the hidden groups, which oracles are told; the problem's comparisons are
+            of these.
         num_groups: Number of groups G.
         digests: Of ``segments`` and ``preferences``: what is loaded must have been trained on them.
         generator: Source of initial weights and batches.
@@ -213,9 +214,18 @@ def train_baselines(
             "the loaded preferences name no hidden groups, which the oracle needs; set "
             "evaluation.baselines=false"
         )
-    strict = preferences[ANSWER] <= Answer.SECOND
-    weight = group_weights(preferences[GROUP][strict], num_groups)
+    weight = group_weights(_groups_of(problem.comparisons, preferences), num_groups)
     return train(GroupCPL(problem, weight=weight, generator=generator), progress=progress)
+
+
+def _groups_of(comparisons: Comparisons, preferences: TensorDictBase) -> Tensor:
+    """Hidden group of who gave the answer that each comparison is of, ``[M]``."""
+    has_halves = comparisons.answer is not None and comparisons.stage is None
+    kept = preferences[ANSWER] <= (Answer.TIE if has_halves else Answer.SECOND)
+    group: Tensor = preferences[GROUP][kept]
+    if comparisons.answer is None or not has_halves:
+        return group
+    return group[comparisons.answer.to(group.device)]
 
 
 def _load_baselines(

@@ -142,7 +142,8 @@ def split(people: People, config: PeopleConfig, number: int, *, ties: str, seed:
         people.data.preferences, cases="rater", ties=cast("Any", ties)
     )
     # Cases of people with ties alone have no number among the strict answers.
-    learnt = _of_people(everything, people, others & ~chosen) if ties != "drop" else None
+    has_ties = ties != "drop" and everything.stage is None
+    learnt = _of_people(everything, people, others & ~chosen) if has_ties else None
     training = learnt or _some(people.answers, others & ~chosen)
     groups = []
     if learnt is None and any(people.groups):

@@ -2,11 +2,15 @@ import math
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from popl_rl.algorithms.cpl import GroupCPL
+from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.variation import GaussianHead, GradientCPL
+from popl_rl.config import EvaluationConfig, Training
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
+from popl_rl.experiments.builders import train_baselines
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.randomness import stream
@@ -140,3 +144,28 @@ def test_vpl_needs_ids_policies_and_whole_networks(learner, learning):
         built(learner, learning, evolve="head", **vpl)
     with pytest.raises(ValueError, match="method vpl needs a hidden layer"):
         built(learner, (RewardSpec(5, 2, ()), bank, comparisons), **vpl)
+
+
+@pytest.mark.parametrize("ties", ["drop", "count", "rao_kupper"])
+def test_oracles_are_told_whose_ties_are_whose(ties):
+    """Group 0 wants large items, group 1 small ones; every third answer is a tie."""
+    generator = torch.Generator().manual_seed(0)
+    value = torch.randn(20, 1, generator=generator)
+    pair = torch.rand(240, 20, generator=generator).argsort(1)[:, :2]
+    group = torch.arange(240) % 2
+    larger = (value[pair[:, 1], 0] > value[pair[:, 0], 0]).long()
+    answer = torch.where(group == 0, larger, 1 - larger)
+    answer[::3] = 2
+    preferences = {"pair": pair, "answer": answer, "rater": group, "hidden": {"group": group}}
+    preferences = TensorDict(preferences, [240])
+    said = Comparisons.from_preferences(preferences, cases="rater", ties=ties)
+    bank = SegmentBank(value, torch.arange(20)[:, None], torch.zeros(20, 1).long(), False)
+    training = Training(steps=60, batch_size=32, learning_rate=0.1, alpha=1.0)
+    problem = Problem(RewardSpec(1, 1, ()), bank, said, training, generations=2)
+    found = train_baselines(
+        EvaluationConfig(), problem, preferences, num_groups=2, generator=generator
+    )
+    slope = found.population(value.sort(0).values)[..., 0].diff(dim=1).mean(1)
+    assert slope[1] > 0.1
+    assert slope[2] < -0.1
+    assert slope[0].abs() < slope[1:].abs().min() / 2

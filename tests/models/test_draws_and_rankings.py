@@ -139,6 +139,12 @@ def test_rows_of_a_ranking_keep_together_and_some_of_them_are_one_among_fewer():
     assert found.exp().item() == pytest.approx(1 / (1 + math.exp(-1)))
 
 
+def test_ties_beside_rankings_are_left_out():
+    data = preferences([[0, 1], [0, 2], [1, 2]], [0, 0, 2], [0, 0, 1], ranking=[0, 0, -1])
+    said = Comparisons.from_preferences(data, cases="rater", ties="count")
+    assert (len(said), said.num_dropped, said.num_cases) == (2, 1, 1)
+
+
 @pytest.mark.parametrize("answer", [2, 3])
 def test_rankings_with_ties_are_refused(answer):
     data = preferences([[0, 1], [0, 2]], [0, answer], [0, 0], ranking=[0, 0])
