@@ -301,10 +301,14 @@ def describe(
     problem = setting.problem
     comparisons, method = problem.comparisons, config.method
     effective = found.effective_number(problem.bank, comparisons)
+    kind = "strict"
+    if comparisons.answer is not None:
+        kind = f"of {int(comparisons.answer.max()) + 1} answers"
+    left_out = f"{comparisons.num_dropped} ties and skips left out"
     ties = {} if comparisons.tied is None else {"tie threshold": f"{comparisons.threshold:.3g}"}
     return {
         f"{found.folder} in the set": f"{len(found)}, effectively {effective:.1f}",
-        "comparisons": f"{len(comparisons)} strict, {comparisons.num_dropped} ties and skips",
+        "comparisons": f"{len(comparisons)} {kind}, {left_out}",
         "cases": f"{comparisons.num_cases} ({method.cases}s)",
         **ties,
         "recipe": ", ".join(f"{name} {value:g}" for name, value in vars(method.training).items()),
