@@ -28,14 +28,47 @@ from popl_rl.models.schedules import linear_decay
 from popl_rl.models.scoring import rater_accuracy
 from popl_rl.selection.farthest_first import farthest_first
 
-__all__ = ["VPL", "divergence", "spread_points"]
+__all__ = ["VPL", "active_units", "divergence", "spread_points", "swap_guidance"]
 
 _MOST = 64  # policies in the set
+_ACTIVE = 0.01  # variance over raters from which on a number of z says something
 
 
 def divergence(mean: Tensor, log_std: Tensor) -> Tensor:
     """KL divergence of N(mean, std) from N(0, 1), summed over the last dimension, ``[...]``."""
     return ((2 * log_std).exp() + mean.square() - 1 - 2 * log_std).sum(-1) / 2
+
+
+def swap_guidance(mean: Tensor, log_std: Tensor, swapped: tuple[Tensor, Tensor]) -> Tensor:
+    """How far beliefs are from mirrored ones about raters who said the opposite, ``[...]``.
+
+    After swap-guided preference learning (SPL; Kim and Kim, 2026, arXiv 2603.12595), against a
+    collapse of all beliefs into one: one belief for everybody cannot be its own mirror image.
+
+    Args:
+        mean: ``[..., L]``.
+        log_std: ``[..., L]``.
+        swapped: The same of the beliefs after all answers were swapped.
+
+    Returns:
+        ``1 + cos`` of the two means, 0 where they are opposed, plus the mean squared difference of
+        the logarithms of the standard deviations, which should be alike.
+    """
+    opposite, log_opposite = swapped
+    apart = 1 + F.cosine_similarity(mean, opposite, dim=-1)
+    return apart + (log_std - log_opposite).square().mean(-1)
+
+
+def active_units(mean: Tensor) -> int:
+    """Numbers of z that differ between raters (Burda et al., 2016, arXiv 1509.00519).
+
+    Args:
+        mean: The mean of the belief about each rater, ``[C, L]``.
+
+    Returns:
+        How many have a variance over raters above 0.01; 0 if all beliefs have collapsed into one.
+    """
+    return int((mean.var(0, correction=0) > _ACTIVE).sum())
 
 
 def spread_points(points: Tensor, count: int) -> Tensor:
@@ -68,8 +101,8 @@ class VPL:
         problem: What is to be learnt. Its batch size, divided by the answers of a rater, makes the
             number of raters in a batch.
         vpl: Length L of z; weight of the divergence, where 1 is the bound itself, under which three
-            groups shared one number of z on two doors and blurred; answers of each rater, drawn
-            with replacement.
+            groups shared one number of z on two doors and blurred; weight of the guidance by
+            swapped answers; answers of each rater, drawn with replacement.
         generator: Source of all randomness.
 
     Attributes:
@@ -78,7 +111,7 @@ class VPL:
 
     Raises:
         ValueError: If hypotheses have no bias that z could be, or style codes, every case is one
-            preference, ``latent`` is below 1 or ``kl`` negative.
+            preference, ``latent`` is below 1, or ``kl`` or ``swap`` negative.
     """
 
     def __init__(self, problem: Problem, *, vpl: VPLSettings, generator: torch.Generator) -> None:
@@ -100,6 +133,9 @@ class VPL:
             raise ValueError(f"vpl.latent must be at least 1, got {vpl.latent}")
         if not vpl.kl >= 0:
             raise ValueError(f"vpl.kl must be at least 0, got {vpl.kl}")
+        if not vpl.swap >= 0:
+            raise ValueError(f"vpl.swap must be at least 0, got {vpl.swap}")
+        self.swap = vpl.swap
         self.problem, self.spec = problem, cast("PolicySpec | RewardSpec", problem.spec)
         self.kl, self.answers, self.latent = vpl.kl, vpl.answers, vpl.latent
         self.raters = max(1, problem.training.batch_size // vpl.answers)
@@ -117,14 +153,15 @@ class VPL:
 
         Returns:
             Scalars to log: ``worst_rater_accuracy`` (10 % quantile over cases of the best policy's
-            accuracy) and ``mean_accuracy``, both as the generation found them, ``loss_cpl`` and
-            ``divergence``.
+            accuracy), ``mean_accuracy`` and ``active_units``, as the generation found them,
+            ``loss_cpl`` and ``divergence``.
         """
         passed = self.problem.pass_shares(self.population)
+        active = active_units(self.beliefs())
         loss, apart = torch.zeros(2)
         for _ in range(self.problem.block):
-            loss, apart = self._losses()
-            bound = loss + self.kl * apart / self.answers
+            loss, apart, mirrored = self._losses()
+            bound = loss + self.kl * apart / self.answers + self.swap * mirrored
             self.optimizer.zero_grad(set_to_none=True)
             bound.backward()  # type: ignore[no-untyped-call]
             self.optimizer.step()
@@ -135,10 +172,11 @@ class VPL:
             "mean_accuracy": passed.mean,
             "loss_cpl": float(loss.detach()),
             "divergence": float(apart.detach()),
+            "active_units": float(active),
         }
 
-    def _losses(self) -> tuple[Tensor, Tensor]:
-        """CPL loss of an answer, and divergence of a rater's belief, both of a fresh batch."""
+    def _losses(self) -> tuple[Tensor, Tensor, Tensor]:
+        """CPL loss of an answer, divergence and guidance of a rater's belief, of a fresh batch."""
         source, said = self.generator, self.problem.comparisons
         rater = torch.randint(
             said.num_cases, (self.raters,), generator=source, device=self.problem.device
@@ -164,7 +202,11 @@ class VPL:
                 self.spec.cloning(recipe.bc), alpha=recipe.alpha, bank=self.problem.bank
             ),
         ).mean()
-        return loss, divergence(mean, log_std).mean()
+        mirrored = torch.zeros_like(loss)
+        if self.swap > 0:
+            swapped = self.encoder(self.problem.bank, other, preferred)
+            mirrored = swap_guidance(mean, log_std, swapped).mean()
+        return loss, divergence(mean, log_std).mean(), mirrored
 
     def scores(self, segment: Tensor, z: Tensor) -> Tensor:
         """Scores of segments ``[B, K]`` by the policies for z ``[B, L]``, ``[B, K]``."""

@@ -177,13 +177,14 @@ class VPLSettings:
 
     latent: int = 8  # numbers that say what a rater wants
     kl: float = 0.1  # weight of their divergence from N(0, 1)
+    swap: float = 0.0  # weight of SPL's guidance: who said the opposite wants the opposite
     answers: int = 16  # answers of each rater in a batch
 
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
         at.at_least_one(self, "latent", most=10**4)
         at.at_least_one(self, "answers")
-        at.not_negative(self, "kl")
+        at.not_negative(self, "kl", "swap")
 
 
 @dataclass

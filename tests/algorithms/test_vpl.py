@@ -7,7 +7,13 @@ import torch
 from tensordict import TensorDict
 
 from popl_rl.algorithms.problem import Problem
-from popl_rl.algorithms.vpl import VPL, divergence, spread_points
+from popl_rl.algorithms.vpl import (
+    VPL,
+    active_units,
+    divergence,
+    spread_points,
+    swap_guidance,
+)
 from popl_rl.config import Training, VPLSettings
 from popl_rl.data.bank import SegmentBank
 from popl_rl.keys import ANSWER, PAIR, RATER
@@ -23,7 +29,7 @@ CONTINUOUS = PolicySpec(3, 2, False, (6, 6))
 
 
 def build(bank, comparisons, *, seed=0, spec=SPEC, **settings):
-    own = {name: settings.pop(name) for name in ("kl", "latent") if name in settings}
+    own = {name: settings.pop(name) for name in ("kl", "latent", "swap") if name in settings}
     generations = settings.pop("generations", 4)
     steps = settings.pop("steps", 3) * generations
     training = Training(steps=steps, **{"batch_size": 32, **settings})
@@ -49,6 +55,23 @@ def test_divergence_by_hand():
     both = divergence(torch.tensor([1.0, 0.0]), torch.tensor([1.0, 2.0]).log())
     assert float(both) == pytest.approx(0.5 + 1.5 - math.log(2))
     assert float(divergence(torch.zeros(3), torch.zeros(3))) == 0
+
+
+def test_swap_guidance_by_hand():
+    """Opposed means of the same spread: 0. Equal ones: 2. At right angles, and a logarithm of one
+    of two standard deviations off by 2: 1 + 4 / 2."""
+    mean, flat = torch.tensor([1.0, 0.0]), torch.zeros(2)
+    assert float(swap_guidance(mean, flat, (-3 * mean, flat))) == pytest.approx(0)
+    assert float(swap_guidance(mean, flat, (2 * mean, flat))) == pytest.approx(2)
+    aside = torch.tensor([0.0, 1.0]), torch.tensor([2.0, 0.0])
+    assert float(swap_guidance(mean, flat, aside)) == pytest.approx(3)
+
+
+def test_active_units_by_hand():
+    """Variances over raters of 0, 0.0025 and 1."""
+    beliefs = torch.tensor([[0.5, 0.05, 1.0], [0.5, -0.05, -1.0]])
+    assert active_units(beliefs) == 1
+    assert active_units(beliefs[:1]) == 0
 
 
 def test_points_far_from_each_other_by_hand():
@@ -108,7 +131,13 @@ def test_a_generation_moves_everything_and_reports_numbers(bank, comparisons):
     assert isinstance(popl, VPL)
     before = tensors(popl)
     metrics = popl.step()
-    assert set(metrics) == {"worst_rater_accuracy", "mean_accuracy", "loss_cpl", "divergence"}
+    assert set(metrics) == {
+        "worst_rater_accuracy",
+        "mean_accuracy",
+        "loss_cpl",
+        "divergence",
+        "active_units",
+    }
     assert all(isinstance(value, float) and math.isfinite(value) for value in metrics.values())
     assert not any(map(torch.equal, before, tensors(popl)))
 
@@ -243,3 +272,25 @@ def test_reward_functions_are_learnt_and_kept_likewise(bank, comparisons, tmp_pa
     assert isinstance(loaded, EncodedRewardSet)
     answers = TensorDict({"pair": torch.tensor([[0, 1]]), "answer": torch.tensor([0])}, [1])
     assert loaded.cater(bank, answers).member == found.cater(bank, answers).member
+
+
+def test_guidance_mirrors_beliefs_about_who_said_the_opposite(bank, comparisons):
+    def mirrored(swap):
+        popl = build(bank, comparisons, swap=swap, generations=20, steps=10, learning_rate=0.02)
+        for _ in range(20):
+            popl.step()
+        mine = [comparisons.rows(comparisons.case == rater) for rater in range(8)]
+        beliefs, opposite = (
+            [popl.encoder(bank, *sides(one)) for one in mine]
+            for sides in (
+                lambda one: (one.preferred[None], one.other[None]),
+                lambda one: (one.other[None], one.preferred[None]),
+            )
+        )
+        guided = [
+            swap_guidance(*own, swapped) for own, swapped in zip(beliefs, opposite, strict=True)
+        ]
+        return float(torch.cat(guided).mean().detach())
+
+    assert mirrored(1.0) < 0.2
+    assert mirrored(0.0) > 2 * mirrored(1.0)
