@@ -9,7 +9,8 @@ Nothing here imports raters: a learner cannot see who voted.
 ``popl``: POPL; ``assembly``: POPL from its settings; ``refinement``: its last training;
 ``mixture_population``: POPL without rater ids.
 ``niches``: POPL for any number of groups; ``niche_search``: one of its searches; ``divisions``:
-how it divides raters; ``agreement``: what searches agree upon; ``specialists``: a member for a
+how it divides raters; ``agreement``: what searches agree upon; ``niche_members``: fresh members for
+a division; ``trials``: numbers of niches tried out with them; ``specialists``: a member for a
 rater; ``needed``: which members, and how many, raters need; ``stacked_adam``: an optimiser for a
 population that grows and shrinks.
 ``multi_cpl``: CPL ensembles; ``cpl``: pooled CPL and the oracle; ``em``: EM mixtures;

@@ -4,27 +4,26 @@ Several searches (see ``popl_rl.algorithms.niche_search``) run side by side, and
 out of one. In the first part of a search, members divide the raters among themselves, and lexicase
 selects the parents of new members. In the second, populations of several sizes train on. What most
 searches agree upon (see ``popl_rl.algorithms.agreement``) is judged by the raters who were held
-out: the number of niches is taken that predicts people whom nobody has learnt of best. At last,
-fresh members are trained by the whole recipe on the division of the raters that was found: what was
-learnt while it was wrong would stay otherwise.
+out, as it was found and by fresh members (see ``popl_rl.algorithms.trials``): the number of niches
+is taken that predicts people whom nobody has learnt of best. At last, fresh members are trained by
+the whole recipe on the division of the raters that was found: what was learnt while it was wrong
+would stay otherwise.
 """
 
 import warnings
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from popl_rl.algorithms.agreement import agreements
-from popl_rl.algorithms.divisions import responsibility
+from popl_rl.algorithms.agreement import Agreement, agreements
 from popl_rl.algorithms.needed import behind_best, standard_error, sufficient
-from popl_rl.algorithms.niche_search import NicheSearch, descend_served
+from popl_rl.algorithms.niche_members import NicheMembers
+from popl_rl.algorithms.niche_search import NicheSearch
 from popl_rl.algorithms.problem import Problem
-from popl_rl.algorithms.stacked_adam import StackedAdam
+from popl_rl.algorithms.trials import Fold, Trial, trials
 from popl_rl.config import NicheSettings, POPLSettings
 from popl_rl.models.hypothesis_set import HypothesisSet
 from popl_rl.models.population import Population
-from popl_rl.models.schedules import decay
 from popl_rl.models.scoring import rater_accuracy
 
 __all__ = ["NichePOPL"]
@@ -91,7 +90,7 @@ class NichePOPL:
             )
             for index in range(count)
         ]
-        self.found: _Niches | None = None
+        self.found: NicheMembers | None = None
 
     def step(self) -> dict[str, float]:
         """Run one generation.
@@ -148,29 +147,29 @@ class NichePOPL:
             losses.append(search.step())
         return sum(losses) / len(losses)
 
-    def _train(self, found: "_Niches") -> float:
+    def _train(self, found: NicheMembers) -> float:
         """E-step, once members know whom they serve, and gradient steps."""
-        problem = self.problem
         now, last = self.generation - self.settled, self.generations - self.settled
         if now >= _GIVEN * last:
-            found.served = responsibility(problem, found.stack, found.share)
-            found.share = found.served.mean(1)
-        found.training.optimizer.param_groups[0]["lr"] = problem.training.learning_rate * decay(
-            now, last
-        )
-        return descend_served(problem, found.stack, found.training, found.served, self.generator)
+            found.divide_anew()
+        return found.step(now, last)
 
     def _settle(self) -> None:
         """Choose the number of niches by raters held out, and start anew from who is in which."""
         for search in self.searches:
             if not search.sizes:
                 search.divide()
-        judged = [search.judged for search in self.searches]
         divided = [search.divisions() for search in self.searches]
+        judged = [search.judged for search in self.searches]
         agreed = agreements(self.problem, judged, divided)
-        behind = behind_best(torch.stack([one.value for one in agreed]))
-        best = agreed[sufficient(behind, evidence=self.settings.evidence)]
-        mean = [float(one.value.mean()) for one in agreed]
+        tried = self._try_out(agreed)
+        values = [one.value for one in agreed]
+        for index, trial in tried.items():
+            values[index] = max(values[index], trial.value, key=torch.mean)
+        behind = behind_best(torch.stack(values))
+        chosen = sufficient(behind, evidence=self.settings.evidence)
+        best = agreed[chosen]
+        mean = [float(value.mean()) for value in values]
         error = standard_error(behind).tolist()
         number = [one.number for one in agreed]
         self.sizes = list(zip(number, mean, error, strict=True))
@@ -182,8 +181,19 @@ class NichePOPL:
                 "there may be more groups than members; raise method.members",
                 stacklevel=2,
             )
-        self.scale = best.scale(judged)
-        self.found = _Niches(self.problem, best.served(self.problem), generator=self.generator)
+        self.scale = tried[chosen].scale if chosen in tried else best.scale(judged)
+        self.found = NicheMembers(self.problem, best.served(self.problem), generator=self.generator)
+
+    def _try_out(self, agreed: list[Agreement]) -> dict[int, Trial]:
+        """Trials of the numbers that look best, with the steps of ``niches.trial_steps``."""
+        generations = -(-self.settings.trial_steps // self.problem.block)
+        return trials(
+            self.problem,
+            [Fold(search.problem, search.judged) for search in self.searches],
+            agreed,
+            generations=min(generations, self.problem.generations),
+            generator=self.generator,
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the next generation depends on."""
@@ -206,28 +216,6 @@ class NichePOPL:
                 search.load_state_dict(own)
         else:
             served = state["found"]["served"]
-            self.found = _Niches(self.problem, served, generator=self.generator)
+            self.found = NicheMembers(self.problem, served, generator=self.generator)
             self.found.load_state_dict(state["found"])
         self.generator.set_state(state["generator"].cpu())
-
-
-class _Niches:
-    """Fresh members for a division of the raters ``served``, ``[K, C]``."""
-
-    def __init__(self, problem: Problem, served: Tensor, *, generator: torch.Generator) -> None:
-        self.served, self.share = served, served.mean(1)
-        self.stack = problem.initial_population(len(served), generator=generator)
-        self.training = StackedAdam(self.stack, problem.training.learning_rate)
-
-    def state_dict(self) -> dict[str, Any]:
-        return {
-            "members": self.stack.members.data.clone().to_dict(),
-            "served": self.served.clone(),
-            "share": self.share.clone(),
-            "training": self.training.state_dict(),
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.stack.members.data.update_(state["members"])
-        self.served, self.share = state["served"].clone(), state["share"].clone()
-        self.training.load_state_dict(state["training"])

@@ -100,11 +100,12 @@ class NicheSettings:
     specialists: int = 256  # raters, at most, for each of whom a specialist may be a founder
     selections: int = 6  # times in a search that unneeded members make room for children
     settled: float = 0.55  # generations of the searches, in those that the fresh members have
+    trial_steps: int = 600  # CPL steps of a number's trial, at most those of the final training
     evidence: float = 0.0  # standard errors by which fewer niches may predict raters worse
 
     def check(self, at: Checker) -> None:
         """Report values that are out of range."""
-        at.at_least_one(self, "specialists", "selections")
+        at.at_least_one(self, "specialists", "selections", "trial_steps")
         at.expect(self.searches >= 2, "searches", "at least 2", self.searches)
         at.expect(0 < self.settled < 1, "settled", "in (0, 1)", self.settled)
         at.not_negative(self, "evidence")
