@@ -4,6 +4,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 from hydra.core.hydra_config import HydraConfig
+from hypothesis import settings
 
 import popl_rl.trainers.run_benchmark
 import popl_rl.trainers.train_popl  # noqa: F401 - they make the schemas known to Hydra
@@ -21,6 +22,10 @@ from popl_rl.raters.groups import make_groups
 from popl_rl.raters.people import Raters
 from popl_rl.testing import likes_left, likes_right, tiny_env
 from popl_rl.trainers.typed import opened
+
+# How long an example takes says how busy the machine is.
+settings.register_profile("popl_rl", deadline=None)
+settings.load_profile("popl_rl")
 
 # Small tensors are slower on several threads, and tests share their cores.
 torch.set_num_threads(1)

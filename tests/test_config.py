@@ -341,3 +341,12 @@ def test_values_outrank_choices_whatever_their_order(config_of):
 def test_a_method_outranks_an_environment(config_of):
     config = config_of("env=hidden_utility", "method=popl_published")
     assert (config.method.members, config.method.generations) == (100, 100)
+
+
+@pytest.mark.parametrize(
+    ("raters", "count", "answers"),
+    [("ring_4", 80, 16), ("ring_32", 640, 16), ("continuum", 300, 8), ("identity", 128, 16)],
+)
+def test_raters_say_how_many_they_are_whatever_their_environment(config_of, raters, count, answers):
+    config = config_of("env=hidden_utility", f"raters={raters}")
+    assert (config.raters.count, config.raters.answers) == (count, answers)

@@ -43,7 +43,7 @@ def with_starts(world, segments):
     segments = segments.clone()
     segments["info", "start"] = start.unsqueeze(-1).expand(segments.shape).clone()
 
-    def collect(num_segments, length, *, generator, progress=None):
+    def collect(num_segments, length, *, generator, progress=None, workers=None):
         return segments[:num_segments]
 
     return dataclasses.replace(world, collect=collect)
