@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 __all__ = ["Workers", "count_workers", "worker_pool", "workers_for"]
 
 _Result = TypeVar("_Result")
+_CURE = "if memory ran out, set fewer workers"
 
 
 def count_workers(setting: str | int) -> int:
@@ -80,15 +81,17 @@ class Workers:
             function: Something that can be imported there.
             *arguments: What it is called with, which crosses to the other process.
 
+        Returns:
+            Its ``result()`` raises what the function raised, or ``BrokenProcessPool`` where the
+            process died before the end.
+
         Raises:
-            RuntimeError: If the process has died. So does ``result()``.
+            BrokenProcessPool: If the process has died before.
         """
         try:
             return self._pools[worker].submit(function, *arguments)
         except BrokenProcessPool as error:
-            raise RuntimeError(
-                f"worker process {worker} was killed; if memory ran out, set fewer workers"
-            ) from error
+            raise BrokenProcessPool(f"worker process {worker} was killed; {_CURE}") from error
 
     def close(self) -> None:
         """End the processes; of what they were asked, they do no more than one or two things."""
@@ -109,13 +112,20 @@ def workers_for(setting: str | int, *, threads: int) -> Iterator[Workers | None]
     Args:
         setting: See ``count_workers``.
         threads: Torch threads of each.
+
+    Raises:
+        ValueError: If ``setting`` is not positive.
+        BrokenProcessPool: If one of them dies and the block needs it; with what to do about it.
     """
     count = count_workers(setting)
     if count == 1:
         yield None
         return
-    with Workers(count, threads=threads) as workers:
-        yield workers
+    try:
+        with Workers(count, threads=threads) as workers:
+            yield workers
+    except BrokenProcessPool as error:
+        raise BrokenProcessPool(f"a worker process was killed; {_CURE}") from error
 
 
 def _begin_worker(threads: int | None) -> None:

@@ -3,10 +3,12 @@
 import multiprocessing
 import os
 import time
+from concurrent.futures.process import BrokenProcessPool
 
 import pytest
 
 from popl_rl.processes import Workers, count_workers, workers_for
+from popl_rl.trainers.command import run_command
 
 
 def test_each_worker_is_one_process_that_works_in_turn():
@@ -36,10 +38,26 @@ def test_what_has_not_begun_is_not_done_at_the_end(tmp_path):
 
 def test_a_killed_worker_is_told():
     with Workers(1, threads=None) as workers:
-        with pytest.raises(RuntimeError):
+        with pytest.raises(BrokenProcessPool):
             workers.submit(0, os._exit, 1).result()
-        with pytest.raises(RuntimeError, match=r"worker process 0 was killed.*fewer workers"):
+        with pytest.raises(BrokenProcessPool, match=r"worker process 0 was killed.*fewer workers"):
             workers.submit(0, os.getpid)
+
+
+def test_a_killed_worker_is_told_with_a_cure(monkeypatch, capsys):
+    """Whoever waits for a result, a command ends with one line and no traceback."""
+
+    def main():
+        with workers_for(2, threads=1) as workers:
+            workers.submit(1, os._exit, 1).result()
+
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    monkeypatch.setattr("sys.argv", ["popl-train"])
+    with pytest.raises(SystemExit) as stop:
+        run_command(main)
+    assert stop.value.code == 2
+    said = "error: a worker process was killed; if memory ran out, set fewer workers"
+    assert capsys.readouterr().err.strip() == said
 
 
 def test_one_worker_is_this_process():

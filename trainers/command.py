@@ -4,6 +4,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
@@ -45,7 +46,14 @@ __all__ = [
 #: Names of the configurations that are settings of a run.
 _RUNS = ("train", "people")
 #: Errors that mean the user can put it right; anything else is a defect and keeps its traceback.
-USER_ERRORS = (HydraException, OmegaConfBaseException, ValueError, TypeError, OSError)
+USER_ERRORS = (
+    HydraException,
+    OmegaConfBaseException,
+    ValueError,
+    TypeError,
+    OSError,
+    BrokenProcessPool,  # a killed worker, mostly for want of memory
+)
 
 
 def register_schemas() -> None:

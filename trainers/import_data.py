@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from popl_rl.config import Checker, check_workers
-from popl_rl.processes import workers_for
+from popl_rl.processes import count_workers, workers_for
 from popl_rl.trainers.command import USER_ERRORS, read_options
 from popl_rl.trainers.terminal import steady_terminal
 
@@ -73,7 +73,9 @@ def _import(
         from popl_rl.experiments.encoding import encoded
 
         kept = None if cache is None else Path(cache)
-        with workers_for(workers, threads=torch.get_num_threads()) as processes:
+        # Together as many threads as this process has.
+        threads = max(1, torch.get_num_threads() // count_workers(workers))
+        with workers_for(workers, threads=threads) as processes:
             data = encoded(data, encode, cache=kept, workers=processes)
     for line in summarise(data).lines():
         print(line)

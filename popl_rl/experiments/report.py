@@ -113,11 +113,14 @@ def print_results(console: Console, results: pd.DataFrame, label: str) -> None:
     for line in [] if of_people else verdict_lines(results, label):
         console.print(line, soft_wrap=True)
     console.print(people_table(results) if of_people else results_table(results))
-    warnings = [alarm(results), unexplained(results), left_data(results)]
+    alarms = [alarm(results), unexplained(results)]
     if of_people:
-        warnings = [people_alarm(results, label)]
-    for warning in filter(None, warnings):
-        console.print(f"alarm: {warning}", style="bold red", highlight=False, soft_wrap=True)
+        alarms = [people_alarm(results, label)]
+    for problem in filter(None, alarms):
+        console.print(f"alarm: {problem}", style="bold red", highlight=False, soft_wrap=True)
+    warning = None if of_people else left_data(results)
+    if warning:
+        console.print(f"warning: {warning}", style="yellow", highlight=False, soft_wrap=True)
 
 
 def markdown(

@@ -303,7 +303,7 @@ def describe(
     effective = found.effective_number(problem.bank, comparisons)
     kind = "strict"
     if comparisons.answer is not None:
-        kind = f"of {int(comparisons.answer.max()) + 1} answers"
+        kind = f"that say {int(comparisons.answer.max()) + 1} answers"
     left_out = f"{comparisons.num_dropped} ties and skips left out"
     ties = {} if comparisons.tied is None else {"tie threshold": f"{comparisons.threshold:.3g}"}
     return {

@@ -6,9 +6,9 @@ from typing import Literal, cast
 import pandas as pd
 
 from popl_rl.evaluation.statistics import interval, require_columns
+from popl_rl.experiments.cells import COLUMNS
 
 __all__ = [
-    "COLUMNS",
     "Entry",
     "Over",
     "column_pairs",
@@ -18,9 +18,6 @@ __all__ = [
     "rows_of_methods",
     "values_by_seed",
 ]
-
-#: Columns of the rows of a benchmark.
-COLUMNS = ["suite", "scenario", "seed", "method", "choice", "group", "measure", "value"]
 
 Entry = tuple[str, str]
 """A method and how the hypothesis was chosen from what it offers."""

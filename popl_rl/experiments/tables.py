@@ -10,9 +10,9 @@ from typing import Any
 import pandas as pd
 
 from popl_rl.evaluation.statistics import differs_from_zero, interval, require_columns
+from popl_rl.experiments.cells import COLUMNS
 from popl_rl.experiments.markdown import markdown_table
 from popl_rl.experiments.table_rows import (
-    COLUMNS,
     Entry,
     Over,
     column_pairs,

@@ -45,7 +45,7 @@ class WinsTable:
         """Rows that the table is made from.
 
         Args:
-            results: Rows with the columns ``popl_rl.experiments.table_rows.COLUMNS``.
+            results: Rows with the columns ``popl_rl.experiments.cells.COLUMNS``.
 
         Returns:
             Those of its suite, scenarios and methods, of one measure in each scenario and one for
@@ -67,7 +67,7 @@ class WinsTable:
         """Lay the table out.
 
         Args:
-            results: Rows with the columns ``popl_rl.experiments.table_rows.COLUMNS``.
+            results: Rows with the columns ``popl_rl.experiments.cells.COLUMNS``.
 
         Returns:
             The table; a cell is the mean of the differences, paired over seeds, ± half of its own

@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from popl_rl.evaluation.statistics import RESULT_COLUMNS, summary, worst_group
-from popl_rl.experiments.report import markdown, results_table, verdict_lines
+from popl_rl.experiments.report import markdown, print_results, results_table, verdict_lines
 
 RESULTS = pd.DataFrame(
     [
@@ -159,3 +159,17 @@ def test_verdicts_come_first_in_the_report_and_on_the_terminal() -> None:
     fast, slow = verdict_lines(results, "popl")
     assert (fast.style, slow.style) == ("green", "red")
     assert fast.plain.startswith("fast: served")
+
+
+def test_what_is_wrong_alarms_and_leaving_the_data_warns() -> None:
+    rows = [
+        ("popl", "posterior", "upper", "recovery", 0.9),
+        ("popl", "posterior", "upper", "inside_data", 0.5),
+    ]
+    screen = io.StringIO()
+    print_results(
+        Console(file=screen, width=200), pd.DataFrame(rows, columns=RESULT_COLUMNS), "popl"
+    )
+    assert "warning: " in screen.getvalue()
+    assert "50% for upper of their steps" in screen.getvalue()
+    assert "alarm: " not in screen.getvalue()

@@ -2,6 +2,7 @@
 
 import csv
 import math
+from contextlib import nullcontext
 
 import numpy as np
 import pandas as pd
@@ -59,6 +60,25 @@ def imported(table):
     options = [f"items={table}/items.csv"]
     assert import_data.main([str(table / "said.csv"), str(target), *options]) == 0
     return target
+
+
+def test_processes_that_encode_share_the_threads_of_this_one(tmp_path, monkeypatch):
+    pairs = tmp_path / "pairs.jsonl"
+    pairs.write_text(
+        '{"chosen": "short words", "rejected": "a longer text of words"}\n'
+        '{"chosen": "short words", "rejected": "no words at all"}\n'
+    )
+    asked = []
+
+    def workers(count, *, threads):
+        asked.append((count, threads))
+        return nullcontext(None)
+
+    monkeypatch.setattr(import_data, "workers_for", workers)
+    monkeypatch.setattr("torch.get_num_threads", lambda: 5)
+    for count in ("2", "8"):
+        assert import_data.main([str(pairs), "-", "encode=tfidf", f"workers={count}"]) == 0
+    assert asked == [(2, 2), (8, 1)]
 
 
 def test_import_tells_what_it_found(table, capsys):
