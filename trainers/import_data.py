@@ -30,7 +30,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "option", nargs="*", help="name=value of the reader, or of encode=, workers="
     )
-    parser.add_argument("--reader", help="table, npz, chosen, folder or a reference; by itself")
+    parser.add_argument(
+        "--reader", help="table, rankings, npz, chosen, folder or a reference; by itself"
+    )
     given = parser.parse_intermixed_args(arguments)
     try:
         options = read_options(given.option)

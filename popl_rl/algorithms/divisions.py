@@ -135,6 +135,7 @@ def prediction(margin: Tensor, comparisons: Comparisons) -> Tensor:
         ``popl_rl.algorithms.needed.predicted``.
     """
     scale, mistake = fit_response(margin, comparisons)
+    comparisons = comparisons.scaled(scale)
     return predicted(answer_likelihood(scale * margin, comparisons, mistake), comparisons)
 
 

@@ -78,10 +78,15 @@ class Comparisons:
     def __len__(self) -> int:
         return len(self.preferred)
 
+    @cached_property
+    def num_answers(self) -> int:
+        """Answers that the comparisons are of: a ranking is one, and so is a tie."""
+        return len(self) if self.answer is None else int(self.answer.max()) + 1
+
     @property
     def is_single(self) -> bool:
-        """Whether every case is a single preference, as where nobody kept rater ids."""
-        return self.num_cases == len(self)
+        """Whether every case is a single answer, as where nobody kept rater ids."""
+        return self.num_cases == self.num_answers
 
     def weighted(self, value: Tensor, part: slice = _ALL) -> Tensor:
         """Values of comparisons ``[..., M]``, or of a part of them, times how much each counts."""
@@ -155,7 +160,8 @@ class Comparisons:
 
         Args:
             preferences: TensorDict ``[M]`` with ``pair``, ``answer`` and, for rater cases,
-                ``rater``. A rater of -1 is unknown: each such answer is a case of its own.
+                ``rater``. A rater of -1 is unknown: each such answer or ranking is a case of its
+                own.
             cases: ``"preference"`` or ``"rater"``.
             ties: ``"drop"``: ties are left out, soft labels count as the answer that they are
                 nearer to. ``"count"``: both count by halves, or by their ``chance``; with a case
@@ -172,7 +178,7 @@ class Comparisons:
         Raises:
             ValueError: If ``cases`` or ``ties`` is none of these, rater ids are needed and
                 missing, answers are no ``popl_rl.keys.Answer``, no answer is strict, or a ranking
-                holds ties, skips or soft labels.
+                holds ties, skips or soft labels, or is of several raters.
         """
         _check_arguments(preferences, cases, ties)
         answer = preferences[ANSWER]
@@ -196,7 +202,8 @@ class Comparisons:
         if cases == "preference":
             case = torch.arange(len(preferred), device=pair.device)
         else:
-            case = _named(preferences[RATER][kept]).unique(return_inverse=True)[1]
+            own = None if ranking is None else _answers_of(ranking[kept])
+            case = _named(preferences[RATER][kept], own).unique(return_inverse=True)[1]
         count, dropped = int(case.max()) + 1, int((~kept).sum())
         doubt = torch.minimum(chance, 1 - chance)
         unsure = (doubt > 0).nonzero().squeeze(-1)
@@ -236,6 +243,10 @@ class Comparisons:
             for value in (found.answer, found.stage)
         )
         return replace(found, num_dropped=0, answer=answer, stage=stage)
+
+    def scaled(self, factor: float) -> "Comparisons":
+        """The same for margins that are multiplied by a factor: what is a tie stays one."""
+        return replace(self, threshold=factor * self.threshold)
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> "Comparisons":
         """The same with every tensor changed."""
@@ -287,17 +298,20 @@ def _check_answers(answer: Tensor) -> None:
         )
 
 
-def _named(rater: Tensor) -> Tensor:
-    """Raters, with a number of its own for everybody unknown (-1), after the known ones."""
+def _named(rater: Tensor, answer: Tensor | None) -> Tensor:
+    """Raters, with a number of its own for everybody unknown (-1), after the known ones.
+
+    Everybody unknown has given one ``answer``, which with rankings is several comparisons.
+    """
     unknown = rater < 0
     if not bool(unknown.any()):
         return rater
-    own = int(rater.max()) + 1 + unknown.cumsum(0)
+    own = int(rater.max()) + 1 + (unknown.cumsum(0) if answer is None else answer)
     return torch.where(unknown, own, rater)
 
 
 def _rankings(preferences: TensorDictBase) -> Tensor | None:
-    """Ranking of each preference, if there are any, all of whose answers are strict."""
+    """Ranking of each preference, if there are any, each of strict answers of one rater."""
     ranking: Tensor | None = preferences.get(RANKING, None)
     if ranking is None or not bool((ranking >= 0).any()):
         return None
@@ -309,13 +323,27 @@ def _rankings(preferences: TensorDictBase) -> Tensor | None:
             f"them, got {int(wrong.sum())} ties and skips in rankings"
             f"{'' if chance is None else ' and soft labels'}; leave such rankings out"
         )
+    rater = preferences.get(RATER, None)
+    if rater is not None:
+        number = torch.stack([ranking, rater])[:, ranking >= 0].unique(dim=1)[0]
+        if len(shared := number[1:][number.diff() == 0]):
+            raise ValueError(
+                f"a ranking must be of one rater, got {RANKING} {int(shared[0])} for several; "
+                "number rankings over all raters"
+            )
     return ranking
+
+
+def _answers_of(ranking: Tensor) -> Tensor:
+    """Number of the answer that each comparison is of: its ranking, or it alone."""
+    own = int(ranking.max()) + 1 + torch.arange(len(ranking), device=ranking.device)
+    number: Tensor = torch.where(ranking < 0, own, ranking).unique(return_inverse=True)[1]
+    return number
 
 
 def _ranked(said: Comparisons, ranking: Tensor, *, is_case: bool) -> Comparisons:
     """Strict answers, with the rankings and stages that they are part of."""
-    own = int(ranking.max()) + 1 + torch.arange(len(ranking), device=ranking.device)
-    answer = torch.where(ranking < 0, own, ranking).unique(return_inverse=True)[1]
+    answer = _answers_of(ranking)
     stage = torch.stack([answer, said.preferred]).unique(dim=1, return_inverse=True)[1]
     return replace(
         said,

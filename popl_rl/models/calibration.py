@@ -46,12 +46,9 @@ def fit_scale(
         ValueError: If ``mistake`` is outside [0, 0.5).
     """
     margin = InParts.of(margin)
-    if margin.members == 1 or comparisons.num_cases == len(comparisons):
+    if margin.members == 1 or comparisons.is_single:
         return 1.0
-    values = [
-        leave_one_out(_scaled(margin, scale, comparisons, mistake), comparisons).mean()
-        for scale in SCALES
-    ]
+    values = [_evidence(margin, scale, comparisons, mistake) for scale in SCALES]
     return SCALES[int(torch.stack(values).argmax())]
 
 
@@ -79,8 +76,7 @@ def fit_response(
     parts = InParts.of(margin)
 
     def value(scale: float, slip: float) -> float:
-        likelihood = _scaled(parts, scale, comparisons, slip)
-        return float(leave_one_out(likelihood, comparisons).mean())
+        return float(_evidence(parts, scale, comparisons, slip))
 
     scale = max(_COARSE, key=lambda one: value(one, MISTAKE if mistake is None else mistake))
     slip = max(MISTAKES, key=lambda one: value(scale, one)) if mistake is None else mistake
@@ -88,10 +84,12 @@ def fit_response(
     return max(near, key=lambda one: value(one, slip)), slip
 
 
-def _scaled(margin: InParts, scale: float, comparisons: Comparisons, mistake: float) -> InParts:
-    """Likelihood of answers with margins that are multiplied by a factor."""
+def _evidence(margin: InParts, scale: float, comparisons: Comparisons, mistake: float) -> Tensor:
+    """How well each answer is predicted from its rater's others, with margins times a factor."""
+    scaled = comparisons.scaled(scale)
 
     def likelihood(part: slice) -> Tensor:
-        return answer_likelihood(scale * margin.part(part), comparisons, mistake, part)
+        return answer_likelihood(scale * margin.part(part), scaled, mistake, part)
 
-    return InParts(margin.members, likelihood)
+    predicted = leave_one_out(InParts(margin.members, likelihood), scaled)
+    return comparisons.weighted(predicted).mean()

@@ -138,7 +138,9 @@ def _of_draws(margin: Tensor, tied: Tensor | None, threshold: float, mistake: fl
         return log_likelihood(margin, mistake)
     right = F.logsigmoid(margin - threshold)
     strict = _with_slips(right, F.logsigmoid(-margin - threshold), mistake)
-    return torch.where(tied, math.log(math.expm1(2 * threshold)) + 2 * right, strict)
+    # The logarithm of exp(2 threshold) - 1, which may be too large for a number itself.
+    both = 2 * threshold + math.log(-math.expm1(-2 * threshold))
+    return torch.where(tied, both + 2 * right, strict)
 
 
 def fit_threshold(margin: Tensor, comparisons: Comparisons, mistake: float = MISTAKE) -> float:
@@ -163,7 +165,8 @@ def fit_threshold(margin: Tensor, comparisons: Comparisons, mistake: float = MIS
 class InParts:
     """Values of K members on M comparisons, of which a part is worked out at a time.
 
-    So memory does not grow with the comparisons: all at once are ``[K, M]``.
+    So memory does not grow with the comparisons: all at once are ``[K, M]``. Where several
+    comparisons are of one answer, as with rankings and counted ties, they are all in one part.
 
     Args:
         members: How many members K.

@@ -2,12 +2,15 @@
 
 import json
 
+import numpy as np
 import pytest
 import torch
 
+from popl_rl.algorithms.assembly import build_popl
 from popl_rl.algorithms.em import EM
+from popl_rl.algorithms.mixture_population import MixturePOPL
 from popl_rl.algorithms.problem import Problem
-from popl_rl.config import EMSettings, Training
+from popl_rl.config import EMSettings, MixtureSettings, Training
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.data.readers.npz import read_npz
@@ -91,6 +94,21 @@ def test_exported_rankings_are_read_again(tmp_path, items):
             assert torch.equal(found.preferences[key], data.preferences[key])
 
 
+def test_people_may_each_number_their_own_rankings(tmp_path, items):
+    path = tmp_path / "said.csv"
+    rows = ["p,b,a,0,1", "q,b,a,0,1", "p,b,c,0,1", "q,a,c,1,", "p,c,a,0,2"]
+    path.write_text("\n".join(["rater,first,second,answer,ranking", *rows, ""]))
+    data = read_table(path, items=items)
+    assert data.preferences["ranking"].tolist() == [0, 1, 0, -1, 2]
+    write_npz(data, tmp_path / "said.npz")
+    held = dict(np.load(tmp_path / "said.npz"))
+    np.savez(tmp_path / "own.npz", **{**held, "ranking": [1, 1, 1, -1, 2]})
+    again = read_npz(tmp_path / "own.npz").preferences
+    assert torch.equal(again["ranking"], data.preferences["ranking"])
+    said = Comparisons.from_preferences(again, cases="rater")
+    assert said.sizes().tolist() == [2.0, 2.0]  # b and c, each of both
+
+
 def ranked_by(weights, *, people, generator):
     """Five rankings of four of 40 items by each person, half of whom want the opposite."""
     features = torch.randn(40, 3, generator=generator)
@@ -130,6 +148,31 @@ def test_groups_are_told_apart_by_their_rankings(tmp_path):
     questions = draw_questions(said, range(20), most=12, generator=generator)
     for asked, told, judged, mask in zip(*questions_of(questions), strict=True):
         assert not {*said.answer[asked[:told]].tolist()} & {*said.answer[judged[mask]].tolist()}
+
+
+def test_rankings_of_nobody_known_are_learnt_from_by_mixtures(tmp_path):
+    generator = torch.Generator().manual_seed(0)
+    items, rankings = ranked_by([2.0, -1.0, 1.0], people=20, generator=generator)
+    (tmp_path / "items.csv").write_text(items)
+    (tmp_path / "rankings.csv").write_text(rankings)
+    data = read_rankings(tmp_path / "rankings.csv", items=str(tmp_path / "items.csv"))
+    said = Comparisons.from_preferences(data.preferences, cases="preference")
+    bank = SegmentBank.from_segments(data.segments)
+    training = Training(steps=150, learning_rate=0.05, alpha=1.0)
+    problem = Problem(RewardSpec(3, 1, ()), bank, said, training, members=6, generations=4)
+    settings = MixtureSettings(
+        mixtures=3, generations=6, steps=30, first_selection=2, final_steps=60
+    )
+    method = build_popl(problem, mixture=settings, generator=generator)
+    assert isinstance(method, MixturePOPL)
+    while method.generation < method.generations:
+        method.step()
+    found = method.result()
+    accuracy = problem.pass_shares(found.population).values
+    assert accuracy.shape == (len(found), 100)
+    assert float(accuracy.mean(1).amax()) < 0.6  # half of the people want the opposite
+    assert float(accuracy.amax(0).mean()) > 0.7
+    assert found.fair_among(bank, said) == int(accuracy.mean(1).argmax())
 
 
 def questions_of(questions):

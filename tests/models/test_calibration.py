@@ -1,5 +1,9 @@
+import math
+from dataclasses import replace
+
 import pytest
 import torch
+from tensordict import TensorDict
 
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.calibration import SCALES, fit_response, fit_scale
@@ -66,3 +70,43 @@ def test_raters_who_err_are_believed_as_much_as_they_deserve():
 def test_a_given_chance_of_slips_must_be_one():
     with pytest.raises(ValueError, match=r"mistake must be in \[0, 0.5\), got 0.6"):
         fit_response(torch.randn(2, 6), answers(2, 3), mistake=0.6)
+
+
+def told_twice(margin, weight):
+    """Answers of one rater, each a comparison one way and, by the rest of its weight, the other."""
+    weight = torch.tensor(weight)
+    count = torch.arange(len(weight))
+    said = replace(answers(1, 2 * len(count)), answer=count.repeat(2))
+    return torch.cat([margin, -margin], 1), replace(said, weight=torch.cat([weight, 1 - weight]))
+
+
+def test_soft_labels_count_by_their_weights():
+    """Sure by 0.9 of four answers: ``0.9 log sigmoid(m) + 0.1 log sigmoid(-m)`` is best at ln 9.
+
+    Were both halves to count alike, margins would best be nothing, the smallest scale.
+    """
+    margin, said = told_twice(torch.full((2, 4), math.log(9) / 4), [0.9] * 4)
+    assert fit_scale(margin, said, mistake=0.0) == 4.0
+    assert fit_response(margin, said, mistake=0.0)[0] == 4.0
+
+
+@pytest.mark.parametrize("scale", [0.25, 4.0])
+def test_the_threshold_of_ties_has_the_scale_of_the_margins(scale):
+    """Margins and threshold too small or large alike are put right alike."""
+    generator = torch.Generator().manual_seed(0)
+    utility = 2 * torch.randn(3000, generator=generator)
+    first, second = (utility - 1).sigmoid(), (-utility - 1).sigmoid()
+    chance = torch.stack([first, second, 1 - first - second], 1)
+    answer = chance.multinomial(1, generator=generator)[:, 0]
+    segment = torch.arange(6000).view(2, 3000).T
+    rater = torch.arange(3000) % 50
+    data = TensorDict({"pair": segment, "answer": answer, "rater": rater}, [3000])
+    said = Comparisons.from_preferences(data, cases="rater", ties="rao_kupper")
+    score = torch.cat([utility, torch.zeros(3000)]) / scale
+    margin = (score[said.preferred] - score[said.other]).repeat(2, 1)
+    said = replace(said, threshold=1.0 / scale)
+    assert fit_scale(margin, said, mistake=0.0) == scale
+    assert scale / 1.5 < fit_response(margin, said, mistake=0.0)[0] < 1.5 * scale
+    # At the largest scale exp(2 * 32 * 20) does not fit into a number.
+    large = replace(said, threshold=20.0)
+    assert fit_scale(margin, large) in SCALES

@@ -13,6 +13,7 @@ from popl_rl.algorithms.tie_threshold import with_threshold
 from popl_rl.config import Training
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
+from popl_rl.models.calibration import fit_scale
 from popl_rl.models.preference_likelihood import (
     answer_likelihood,
     drawn_likelihood,
@@ -177,3 +178,25 @@ def test_the_threshold_that_answered_is_found():
     assert found == pytest.approx(threshold, abs=0.08)
     told = with_threshold(problem, threshold=0.3, generator=generator)
     assert told.comparisons.threshold == 0.3
+
+
+def test_a_ranking_is_of_one_rater():
+    data = preferences([[0, 1], [0, 2], [1, 2]], [0, 0, 0], [0, 0, 1], ranking=[1, 1, 1])
+    with pytest.raises(ValueError, match=r"must be of one rater, got ranking 1 for several"):
+        Comparisons.from_preferences(data, cases="rater")
+    # Of several unknown ones each ranking is a case, as each other answer is.
+    data = preferences(
+        [[0, 1], [0, 2], [1, 2], [2, 0], [1, 0]], [0] * 5, [-1] * 4 + [3], ranking=[5, 5, 5, -1, -1]
+    )
+    said = Comparisons.from_preferences(data, cases="rater")
+    assert (said.case.tolist(), said.num_cases, said.num_answers) == ([1, 1, 1, 2, 0], 3, 3)
+    assert said.is_single
+
+
+def test_where_every_ranking_is_a_case_there_is_no_scale_to_choose():
+    data = preferences(
+        [[0, 1], [0, 2], [1, 2], [2, 0]], [0, 0, 0, 0], [0] * 4, ranking=[0, 0, 0, 1]
+    )
+    said = Comparisons.from_preferences(data, cases="preference")
+    assert said.is_single
+    assert fit_scale(torch.tensor([[0.1, 0.2, 0.1, 0.3], [1.0, -1.0, 1.0, 1.0]]), said) == 1.0

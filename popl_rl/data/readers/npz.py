@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from popl_rl.data.readers.answers import read_answers
 from popl_rl.data.readers.imported import Imported, Names
 from popl_rl.data.readers.problems import Problems
-from popl_rl.data.readers.table import check_sides, preferences_of
+from popl_rl.data.readers.table import check_sides, number_rankings, preferences_of
 from popl_rl.keys import ACTION, MASK, OBSERVATION, RANKING, REWARD
 
 __all__ = ["read_npz"]
@@ -33,8 +33,9 @@ def read_npz(path: Path, *, score: str | None = None, one_sided: bool = False) -
     ``answer`` ``[M]``. (2) ``obs``, ``action`` and a number for each segment, as CPL (arXiv
     2310.13639) publishes: segments 2i and 2i + 1 are compared, the larger number is preferred, and
     equal ones are ties. (3) CPL's older ``obs_1 obs_2 action_1 action_2`` with ``label``, 1 (or
-    near it) where the second is preferred. ``rater``, ``condition``, ``chance`` ``[M]``
-    (soft labels beside codes) and ``mask`` ``[N, T]`` may be there.
+    near it) where the second is preferred. ``rater``, ``condition``, ``chance`` (soft labels
+    beside codes), ``ranking`` ``[M]`` (which one each is part of, of this rater; -1 for a mere
+    comparison) and ``mask`` ``[N, T]`` may be there.
 
     Args:
         path: The file.
@@ -70,9 +71,14 @@ def read_npz(path: Path, *, score: str | None = None, one_sided: bool = False) -
         check_sides(answer, path)
     columns = [_column(arrays, name, len(pair), path) for name in ("rater", "condition")]
     preferences, raters, conditions = preferences_of(pair, answer, chance, *columns)
-    if "ranking" in arrays:
-        ranking = np.asarray(arrays["ranking"], np.int64)
-        preferences[RANKING] = torch.from_numpy(ranking)
+    ranking = _column(arrays, "ranking", len(pair), path)
+    if ranking is not None:
+        dtype = arrays["ranking"].dtype
+        if dtype.kind not in "iu":
+            raise ValueError(
+                f"{path}: 'ranking' must be whole numbers, -1 for a comparison, got {dtype}"
+            )
+        preferences[RANKING] = number_rankings(ranking, columns[0])
     named = [str(name) for name in arrays.get("conditions", [])]
     if named and conditions:
         conditions = [named[int(number)] for number in conditions]

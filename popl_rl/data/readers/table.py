@@ -16,7 +16,7 @@ from popl_rl.data.readers.items import Items, read_items, read_segments
 from popl_rl.data.readers.problems import Problems
 from popl_rl.keys import ANSWER, CHANCE, CONDITION, PAIR, RANKING, RATER, Answer
 
-__all__ = ["check_sides", "preferences_of", "read_table"]
+__all__ = ["check_sides", "number_rankings", "preferences_of", "read_table"]
 
 
 def read_table(
@@ -54,8 +54,9 @@ def read_table(
         rater: Column of who answered; need not be there, and may be empty in some rows.
         condition: Column of what people were told or which group they are of; likewise. It is
             kept for evaluation and never read by a learner.
-        ranking: Column of which ranking a comparison is part of; likewise. Rankings as lists are
-            read by ``popl_rl.data.readers.rankings.read_rankings``.
+        ranking: Column of which ranking a comparison is part of; likewise. Each rater's may be
+            numbered from 1. Rankings as lists are read by
+            ``popl_rl.data.readers.rankings.read_rankings``.
         one_sided: Accept that all answers prefer the same side.
         progress: Called with the number of rows read so far.
 
@@ -88,8 +89,7 @@ def read_table(
     what = said.get("condition")
     preferences, raters, conditions = preferences_of(pair, code, chance, who, what)
     if "ranking" in said:
-        part = pd.factorize(_as_ids(said["ranking"]).where(said["ranking"].notna()))[0]
-        preferences[RANKING] = torch.from_numpy(part.astype(np.int64))
+        preferences[RANKING] = number_rankings(said["ranking"], who)
     names = Names(things.ids, raters, conditions, things.texts)
     return Imported(things.segments, preferences, names)
 
@@ -133,7 +133,10 @@ def _check_columns(path: Path, piece: pd.DataFrame, columns: dict[str, str]) -> 
     if not missing:
         return
     if "ranking" in piece:
-        raise ValueError(f"{path} holds rankings of several items; read them by reader=rankings")
+        raise ValueError(
+            f"{path} holds rankings of several items; read them by --reader rankings, or "
+            "data.reader=rankings"
+        )
     raise ValueError(
         f"{path} must have the columns {list(columns.values())}, {missing} are missing; it has "
         f"{list(piece)}. Other names are given by options, such as first=left"
@@ -161,6 +164,26 @@ def check_sides(answer: npt.NDArray[np.int64], path: Path) -> None:
             "of answers may be another. If what was preferred always stands there, set "
             "one_sided=true"
         )
+
+
+def number_rankings(ranking: pd.Series, rater: pd.Series | None) -> torch.Tensor:
+    """Number rankings over all raters, who may each have numbered their own.
+
+    Args:
+        ranking: Which ranking each comparison is part of, ``[M]``, of any type; missing where of
+            none.
+        rater: Who answered, likewise; None if nobody kept it.
+
+    Returns:
+        Their numbers from 0, -1 where missing, ``[M]``.
+    """
+    columns = {"ranking": _as_ids(ranking)}
+    if rater is not None:
+        columns["rater"] = _as_ids(rater)
+    there = pd.DataFrame(columns)[ranking.notna()]
+    number = there.groupby(list(columns), sort=False).ngroup()
+    found = number.reindex(ranking.index, fill_value=-1)
+    return torch.from_numpy(found.to_numpy(np.int64, copy=True))
 
 
 def preferences_of(

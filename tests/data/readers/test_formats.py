@@ -69,6 +69,8 @@ def test_older_files_hold_both_sides(tmp_path):
         (arrays(pair=[[0, 9]], answer=[0]), "row 0: 'pair' must name segments in 0..3"),
         (arrays(pair=[[0, 1]], answer=[0, 1]), r"labels must have shape \[1\], got \[2\]"),
         (arrays(pair=[[0, 1]], answer=[0], rater=[1, 2]), r"'rater' must have shape \[1\]"),
+        (arrays(pair=[[0, 1]], answer=[0], ranking=[1, 1]), r"'ranking' must have shape \[1\]"),
+        (arrays(pair=[[0, 1]], answer=[0], ranking=[0.5]), "'ranking' must be whole numbers, -1"),
         (arrays(obs=np.full((4, 2, 3), np.nan), rl_sum=np.zeros(4)), "rows 0, 1, 2, 3: obs"),
         (arrays(rl_sum=[1, np.inf, 0, 0]), "row 1: the number of a segment must be finite"),
     ],

@@ -107,7 +107,7 @@ HEAD = "rater,first,second,answer\n"
         ("first,second\na,b\n", r"must have the columns .* \['answer'\] are missing"),
         (
             "rater,ranking\nx,a>b>c\n",
-            "read them by reader=rankings",
+            "read them by --reader rankings, or data.reader=rankings",
         ),
         (HEAD, "holds no comparisons"),
         (HEAD + "x,a,b,0\n" * 10, "all 10 strict answers prefer the first of the pair"),
