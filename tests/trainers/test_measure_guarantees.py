@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from popl_rl.experiments.guarantees import guarantee_rows
+from popl_rl.experiments.run_manifest import load_run_config
 from popl_rl.plotting.guarantee_plots import guarantee_curves
 from popl_rl.trainers import train_popl
 from popl_rl.trainers.measure_guarantees import main
@@ -62,22 +63,34 @@ def test_a_figure_is_drawn_from_rows(rows):
         guarantee_curves(rows, {"ring_12": "12 groups"})
 
 
-def test_rows_are_kept_and_drawn_again(rows, tmp_path):
-    kept = tmp_path / "configs" / "results"
-    kept.mkdir(parents=True)
+def test_rows_are_kept_and_drawn_again(finished, rows, tmp_path):
+    benchmark = tmp_path / "benchmark"
+    shutil.copytree(finished, benchmark)
+    shutil.copytree(benchmark / "cells/three_groups/popl_2", benchmark / "cells/ring_12/popl_2")
+    (tmp_path / "configs" / "results").mkdir(parents=True)
     (tmp_path / ".assets").mkdir()
-    other = rows.assign(scenario="ring_12")
-    pd.concat([rows, other]).to_csv(kept / "guarantees.csv", index=False)
+    figure = tmp_path / ".assets" / "guarantees.png"
+    assert main([str(benchmark), "--root", str(tmp_path)]) == 0
+    kept = pd.read_csv(tmp_path / "configs/results/guarantees.csv", keep_default_na=False)
+    copied = rows[rows["method"] == "popl_2"].assign(scenario="ring_12")
+    expected = pd.concat([copied, rows], ignore_index=True)
+    pd.testing.assert_frame_equal(kept, expected, rtol=0, atol=1e-4)
+    drawn = figure.read_bytes()
+    assert len(drawn) > 1000
+    figure.unlink()
     assert main(["--root", str(tmp_path)]) == 0
-    assert (tmp_path / ".assets" / "guarantees.png").stat().st_size > 1000
+    assert len(figure.read_bytes()) == len(drawn)
 
 
-def test_what_cannot_be_counted_is_said(finished, tmp_path, capsys):
+def test_what_cannot_be_counted_is_said(finished, tmp_path, capsys, monkeypatch):
     assert main([str(tmp_path), "--root", str(tmp_path)]) == 2
     assert "no finished cells" in capsys.readouterr().err
-    shutil.copytree(finished, tmp_path / "changed")
-    cell = tmp_path / "changed" / "cells" / "three_groups" / "popl_2" / "seed0"
-    text = (cell / "config.yaml").read_text().replace("cases: rater", "cases: preference")
-    (cell / "config.yaml").write_text(text)
-    with pytest.raises(ValueError, match="was changed"):
-        guarantee_rows(tmp_path / "changed")
+
+    def without_ids(run_dir):
+        config = load_run_config(run_dir)
+        config.method.cases = "preference"
+        return config
+
+    monkeypatch.setattr("popl_rl.experiments.guarantees.load_run_config", without_ids)
+    with pytest.raises(ValueError, match=r"popl_2/seed0 .*cases='preference', expected 'rater'"):
+        guarantee_rows(finished)
