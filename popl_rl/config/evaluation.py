@@ -33,8 +33,8 @@ class EvaluationConfig:
     brex_steps: int = 10_000  # steps of B-REX's chain
     dpl_steps: int = 500  # steps of DPL's training
     animate: bool = False  # an animated GIF for each group, where there is a renderer
-    # Comparisons up to which the method is trained on fewer answers too, to tell how many are
-    # missing; 0 for never.
+    # Answers up to which the method is trained on fewer of them too, to tell how many are missing;
+    # 0 for never.
     learning_curve: int = 1000
     history: int = 10  # generations between two snapshots for the pictures; 0 for none
 

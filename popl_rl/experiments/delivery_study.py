@@ -110,7 +110,10 @@ def act_for_people(
             shares = [exact_returns(table, each) for each in score]
             given = dict.fromkeys(fold.held_out, 0)
             if method == "popl":
-                given = catered_members(people, fold, found, answers=answers, seed=config.seed)
+                alpha = config.method.training.alpha
+                given = catered_members(
+                    people, fold, found, alpha=alpha, answers=answers, seed=config.seed
+                )
             rows += [
                 (method, people.names[case], people.groups[case], member, number, *shares[member])
                 for case, member in given.items()

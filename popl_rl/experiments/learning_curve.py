@@ -53,18 +53,18 @@ def learning_curve(
 
     Args:
         config: The run's configuration; ``evaluation.learning_curve`` says up to how many
-            comparisons this is done.
+            answers this is done; a ranking is one, and so is a tie.
         setting: With the data and the evaluator.
         found: The set that was learnt from all answers.
         run_dir: Folder of the run.
 
     Returns:
-        The curve; None if there are too many comparisons, no rater ids, or too few answers of each
+        The curve; None if there are too many answers, no rater ids, or too few answers of each
         rater to leave some out.
     """
     problem = setting.problem
     if (
-        len(problem.comparisons) > config.evaluation.learning_curve
+        problem.comparisons.num_answers > config.evaluation.learning_curve
         or config.method.cases != "rater"
     ):
         return None
@@ -88,7 +88,7 @@ def learning_curve(
             progress.update(count)
     wrong = [_wrong(setting.evaluator, one) for one in [*sets, found]]
     curve = fit_learning_curve(
-        [len(one) for one in [*subsets, problem.comparisons]],
+        [one.num_answers for one in [*subsets, problem.comparisons]],
         [float(one.mean()) for one in wrong],
         # Without any spread one answer more or less counts as its error.
         [max(float(one.std() / len(one) ** 0.5), 1 / one.numel() ** 2) for one in wrong],
@@ -128,13 +128,13 @@ def fewer_answers(
 
 def _subsets(comparisons: Comparisons, *, seed: int) -> list[Comparisons]:
     """Fewer answers of everybody, each part of the next, the smallest first."""
-    each = len(comparisons) / comparisons.num_cases
+    each = comparisons.num_answers / comparisons.num_cases
     subsets = [
         # The same stream for all, so that the fewer answers are among the more.
         fewer_answers(comparisons, count, generator=stream(seed, "fewer answers"))
         for count in sorted({max(_LEAST, ceil(share * each)) for share in _SHARES})
     ]
-    return [one for one in subsets if len(one) < len(comparisons)]
+    return [one for one in subsets if one.num_answers < comparisons.num_answers]
 
 
 def _wrong(evaluator: Evaluator, found: HypothesisSet) -> Tensor:

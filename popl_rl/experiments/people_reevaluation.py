@@ -60,7 +60,8 @@ def evaluate_people_again(config: Config, run_dir: Path, *, seed: int) -> tuple[
         pooled = load_set(run_dir / "cells" / f"{each}-0")
         scale = pooled.alpha / problem.training.alpha
         kept.append(reference(each, pooled, people, problem, config, scale=scale))
-    kept.append(Trained(name, set_predictors(found, people, folds[0]), found))
+    own = set_predictors(found, people, folds[0], alpha=problem.training.alpha)
+    kept.append(Trained(name, own, found))
     table = pd.concat(
         [judge_fold(people, folds[0], each, config.people, seed=seed) for each in kept]
     )

@@ -155,7 +155,7 @@ def train_on(
     found = run(method)
     if isinstance(method, VPL | LoRe):
         return Trained(name, _told_by_answers(method, people, fold), found)
-    return as_trained(name, found, people, fold)
+    return as_trained(name, found, people, fold, alpha=problem.training.alpha)
 
 
 def reference(
@@ -258,18 +258,38 @@ def _scale(margin: Tensor, comparisons: Comparisons) -> float:
     return SCALES[int(torch.stack(each).argmax())]
 
 
-def as_trained(name: str, found: HypothesisSet, people: People, fold: Fold) -> Trained:
-    """A set that is catered, that mixes, and of which one serves all; its scale is chosen."""
+def as_trained(
+    name: str, found: HypothesisSet, people: People, fold: Fold, *, alpha: float
+) -> Trained:
+    """A set that is catered, that mixes, and of which one serves all; its scale is chosen.
+
+    Args:
+        name: Name of the method.
+        found: What it has found, in any scale; it gets the chosen one.
+        people: Everybody.
+        fold: Whom it has learnt from.
+        alpha: Scale of the scores in training, which the threshold of ties is for.
+    """
     found.alpha *= _scale(_margins(found, people, fold.validation), fold.validation)
-    return Trained(name, set_predictors(found, people, fold), found)
+    return Trained(name, set_predictors(found, people, fold, alpha=alpha), found)
 
 
-def set_predictors(found: HypothesisSet, people: People, fold: Fold) -> dict[str, Predictor]:
-    """What predicts by a set whose scale was chosen, by the choice that it makes."""
+def set_predictors(
+    found: HypothesisSet, people: People, fold: Fold, *, alpha: float
+) -> dict[str, Predictor]:
+    """What predicts by a set whose scale was chosen, by the choice that it makes.
+
+    Args:
+        found: The set.
+        people: Everybody.
+        fold: Whom it has learnt from.
+        alpha: Scale of the scores in training, which the threshold of ties is for.
+    """
     learnt = _margins(found, people, fold.training)
-    prior = _shares(learnt, fold.training).clamp(min=1e-3).log()
+    training = fold.training.scaled(found.alpha / alpha)
+    prior = _shares(learnt, training).clamp(min=1e-3).log()
     margin = _margins(found, people, people.answers)
-    likelihood = per_case(answer_likelihood(learnt, fold.training), fold.training)
+    likelihood = per_case(answer_likelihood(learnt, training), training)
     best = int(likelihood.sum(1).argmax())
     return {
         "posterior": SetPredictor(margin, log_prior=prior),
@@ -295,13 +315,14 @@ def _best_em(
         found = run(method)
         margin = _margins(found, people, fold.validation)
         margin = _scale(margin, fold.validation) * margin
-        share = _shares(_margins(found, people, fold.training), fold.training)
+        training = fold.training.scaled(found.alpha / problem.training.alpha)
+        share = _shares(_margins(found, people, training), training)
         likelihood = per_case(answer_likelihood(margin, fold.validation), fold.validation)
         value = float(expect(likelihood, share).evidence.mean())
         if value > most:
             best, most = found, value
     assert best is not None
-    return as_trained("em", best, people, fold)
+    return as_trained("em", best, people, fold, alpha=problem.training.alpha)
 
 
 def _all_questions(answers: Comparisons) -> Questions:
@@ -311,7 +332,7 @@ def _all_questions(answers: Comparisons) -> Questions:
 
 
 def catered_members(
-    people: People, fold: Fold, found: HypothesisSet, *, answers: int, seed: int
+    people: People, fold: Fold, found: HypothesisSet, *, alpha: float, answers: int, seed: int
 ) -> dict[int, int]:
     """The member that each held-out person is given after some answers.
 
@@ -319,13 +340,14 @@ def catered_members(
         people: Everybody.
         fold: Who is held out.
         found: A set that was trained on the others, as `as_trained` has scaled it.
+        alpha: Scale of the scores in training.
         answers: Answers that are told.
         seed: Seed of which they are.
 
     Returns:
         Member by case of the person.
     """
-    posterior = as_trained("", found, people, fold).predictors["posterior"]
+    posterior = as_trained("", found, people, fold, alpha=alpha).predictors["posterior"]
     assert isinstance(posterior, SetPredictor)
     generator = stream(seed, f"held-out people/{fold.number}")
     questions = draw_questions(people.answers, fold.held_out, most=answers, generator=generator)
