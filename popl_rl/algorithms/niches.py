@@ -4,10 +4,11 @@ Several searches (see ``popl_rl.algorithms.niche_search``) run side by side, and
 out of one. In the first part of a search, members divide the raters among themselves, and lexicase
 selects the parents of new members. In the second, populations of several sizes train on. What most
 searches agree upon (see ``popl_rl.algorithms.agreement``) is judged by the raters who were held
-out, as it was found and by fresh members (see ``popl_rl.algorithms.trials``): the number of niches
-is taken that predicts people whom nobody has learnt of best. At last, fresh members are trained by
-the whole recipe on the division of the raters that was found: what was learnt while it was wrong
-would stay otherwise.
+out, as it was found and, for the numbers that look best, by fresh members (see
+``popl_rl.algorithms.trials``): the number of niches is taken that predicts people whom nobody has
+learnt of best. A number that was tried counts by the better of its two values, which favours it a
+little. At last, fresh members are trained by the whole recipe on the division of the raters that
+was found: what was learnt while it was wrong would stay otherwise.
 """
 
 import warnings

@@ -9,6 +9,7 @@ from popl_rl.algorithms.needed import sizes_up_to
 from popl_rl.algorithms.niche_search import NicheSearch
 from popl_rl.algorithms.niches import NichePOPL
 from popl_rl.algorithms.problem import Problem
+from popl_rl.algorithms.trials import Trial
 from popl_rl.config import NicheSettings, POPLSettings, Training
 from popl_rl.data.bank import SegmentBank
 from popl_rl.models.reward_functions import RewardSpec
@@ -162,3 +163,26 @@ def test_it_goes_on_to_the_bit(ring, at):
         strict=True,
     ):
         assert torch.equal(one, other)
+
+
+def test_trials_decide_between_numbers_that_look_alike(ring, monkeypatch):
+    """What is tried counts by its trial where that is better; the scale is the trial's."""
+    bank, comparisons, _ = ring(2, raters=6)
+    method = build(bank, comparisons, steps=60)
+    seen = {}
+
+    def favours_the_last(_problem, folds, agreed, *, generations, generator):
+        seen.update(folds=len(folds), generations=generations, last=len(agreed) - 1)
+        worst, best = agreed[0].value - 1, torch.zeros_like(agreed[0].value)
+        return {0: Trial(worst, 2.0), seen["last"]: Trial(best, 3.0)}
+
+    monkeypatch.setattr("popl_rl.algorithms.niches.trials", favours_the_last)
+    run(method)
+    last = seen.pop("last")
+    assert last > 0
+    assert seen == {"folds": 3, "generations": 20}
+    number, mean, _ = method.sizes[last]
+    assert mean == 0
+    assert all(row[1] < 0 for row in method.sizes[:last])
+    assert len(method.found.share) == number
+    assert method.scale == 3.0
