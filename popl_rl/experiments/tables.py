@@ -87,9 +87,10 @@ class ResultTable:
             results: Rows with the columns ``COLUMNS``.
 
         Returns:
-            The table; a cell is mean ± 95 % interval over seeds [lowest], or – without rows. With
-            ``against``, mean of the differences ± 95 % interval, and an asterisk where it is not 0
-            at a level of 5 % for all cells together (Holm, 1979; t-tests paired over seeds).
+            The table; a cell is mean ± 95 % interval over seeds [lowest], without an interval below
+            three seeds, or – without rows. With ``against``, mean of the differences ± 95 %
+            interval, and an asterisk where it is not 0 at a level of 5 % for all cells together
+            (Holm, 1979; t-tests paired over seeds).
 
         Raises:
             ValueError: If ``results`` lacks a column.
@@ -305,5 +306,6 @@ def _cell(values: Sequence[float]) -> str:
     if not values:
         return "–"
     mean, half = interval(values)
-    spread = f" ± {half:.2f}" if len(values) > 1 else ""
+    # Of two seeds it is 13 standard errors wide, and says nothing.
+    spread = f" ± {half:.2f}" if len(values) > 2 else ""
     return f"{number_text(mean)}{spread} [{number_text(min(values))}]"

@@ -13,14 +13,17 @@ from popl_rl.experiments.tables import (
 
 
 def test_a_cell_is_the_worst_group_over_seeds():
-    """Worst groups 0.4 and 0.6: mean 0.5, standard error 0.1, t(0.975, 1) = 12.706."""
+    """Worst groups 0.4, 0.6 and 0.8: mean 0.6, standard error 0.2 / √3, t(0.975, 2) = 4.303."""
     rows = [
         ("s", "two", seed, "popl", "", group, "recovery", value)
-        for seed, group, value in [(0, "a", 0.4), (0, "b", 0.9), (1, "a", 0.8), (1, "b", 0.6)]
+        for seed, *worths in [(0, 0.4, 0.9), (1, 0.8, 0.6), (2, 0.8, 0.8)]
+        for group, value in zip("ab", worths, strict=True)
     ]
     table = ResultTable("s", "recovery", {("popl", ""): "`popl`"}, {"two": "two", "three": "three"})
     lines = table.markdown(pd.DataFrame(rows, columns=COLUMNS)).splitlines()
-    assert lines[-1] == "| `popl` | 0.50 ± 1.27 [0.40] | – |"
+    assert lines[-1] == "| `popl` | 0.60 ± 0.50 [0.40] | – |"
+    lines = table.markdown(pd.DataFrame(rows[:-2], columns=COLUMNS)).splitlines()
+    assert lines[-1] == "| `popl` | 0.50 [0.40] | – |", "two seeds tell no interval"
 
 
 @pytest.mark.parametrize(("value", "shown"), [(-0.004, "0.00"), (-0.5, "−0.50"), (1.0, "1.00")])
@@ -105,10 +108,10 @@ def test_differences_are_paired_over_seeds():
 def test_measures_of_all_groups_together():
     rows = [
         ("s", "two", seed, "popl", "", group, "distinct", value)
-        for seed, group, value in [(0, "all", 4), (0, "a", 9), (1, "all", 6)]
+        for seed, group, value in [(0, "all", 4), (0, "a", 9), (1, "all", 6), (2, "all", 8)]
     ]
     table = ResultTable("s", "distinct", {("popl", ""): "`popl`"}, {"two": "two"}, over="all")
-    assert "5.00 ± 12.71 [4.00]" in table.markdown(pd.DataFrame(rows, columns=COLUMNS))
+    assert "6.00 ± 4.97 [4.00]" in table.markdown(pd.DataFrame(rows, columns=COLUMNS))
 
 
 def test_what_differs_is_judged_together():
