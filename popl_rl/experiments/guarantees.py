@@ -11,13 +11,10 @@ from popl_rl.data.environments import indexed
 from popl_rl.evaluation.guarantees import guarantees
 from popl_rl.experiments.builders import build_spec
 from popl_rl.experiments.cells import COLUMNS
-from popl_rl.experiments.data import build_groups, build_world, make_data
-from popl_rl.experiments.evaluators import make_evaluator
+from popl_rl.experiments.reevaluation import gather_again
 from popl_rl.experiments.run_manifest import load_run_config
-from popl_rl.experiments.run_sets import load_own_set
+from popl_rl.experiments.run_sets import load_found_set, load_own_set
 from popl_rl.manifest import read_json
-from popl_rl.models.policy_set import PolicySet
-from popl_rl.models.reward_set import RewardSet
 
 __all__ = ["guarantee_rows"]
 
@@ -59,23 +56,10 @@ def _measures(run_dir: Path) -> dict[str, float]:
             f"{run_dir} was trained with cases={config.method.cases!r}, expected 'rater': who is "
             "served at least as well is told over raters; run it with method.cases=rater"
         )
-    is_reward = (run_dir / RewardSet.folder).is_dir()
-    found = load_own_set(run_dir, (RewardSet if is_reward else PolicySet).folder)
-    baselines = load_own_set(run_dir, "baselines")
-    world = build_world(config.env)
-    groups = build_groups(config.raters, world)
-    data = make_data(
-        config.data,
-        config.raters,
-        world,
-        groups,
-        seed=config.seed,
-        env=config.env,
-        load=run_dir / "data" if (run_dir / "data").is_dir() else None,
-    )
-    spec = build_spec(config.method, world.env)
+    found, baselines = load_found_set(run_dir), load_own_set(run_dir, "baselines")
     # As the run evaluated: its own fresh segments and held-out pairs.
-    evaluator = make_evaluator(config, world, groups, data, spec, seed=config.seed)
+    world, data, evaluator = gather_again(config, run_dir, seed=config.seed)
+    spec = build_spec(config.method, world.env)
     measured = guarantees(
         found,
         baselines.subset(list(range(1, len(baselines)))),  # the first is for everybody

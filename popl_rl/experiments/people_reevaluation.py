@@ -16,9 +16,7 @@ from popl_rl.experiments.people_steps import (
 )
 from popl_rl.experiments.people_training import Trained, judge_fold, reference, set_predictors
 from popl_rl.experiments.reevaluation import evaluation_title, new_evaluation
-from popl_rl.experiments.run_sets import load_own_set
-from popl_rl.models.policy_set import PolicySet
-from popl_rl.models.reward_set import RewardSet
+from popl_rl.experiments.run_sets import load_found_set
 from popl_rl.models.sets import load_set
 
 __all__ = ["evaluate_people_again"]
@@ -50,8 +48,7 @@ def evaluate_people_again(config: Config, run_dir: Path, *, seed: int) -> tuple[
             "person by (an encoder, or bases) is not in its set; judge it by popl-people with "
             f"people.methods=[{name}], in folds"
         )
-    is_reward = (run_dir / RewardSet.folder).is_dir()
-    found = load_own_set(run_dir, (RewardSet if is_reward else PolicySet).folder)
+    found = load_found_set(run_dir)
     people = read_people(config, run_dir)
     folds = make_folds(config, people, 1)
     problem = build_problem(config.method, people.spec, people.bank, folds[0].training)

@@ -3,28 +3,28 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
 from popl_rl.config import Config
+from popl_rl.data.environments import World
 from popl_rl.evaluation.diagnostics import diagnostics
+from popl_rl.evaluation.evaluator import Evaluator
 from popl_rl.evaluation.results import Scoreboard
 from popl_rl.experiments.builders import build_spec
-from popl_rl.experiments.data import build_groups, build_world, given_data, make_data
+from popl_rl.experiments.data import Data, build_groups, build_world, given_data, make_data
 from popl_rl.experiments.evaluators import make_evaluator
 from popl_rl.experiments.ppo_policies import check_ppo, ppo_policies, tell_cost
 from popl_rl.experiments.report import markdown
 from popl_rl.experiments.run_folder import save_config
 from popl_rl.experiments.run_manifest import check_own_data
-from popl_rl.experiments.run_sets import load_own_set
+from popl_rl.experiments.run_sets import load_found_set, load_own_set
 from popl_rl.locks import locked
-from popl_rl.models.policy_set import PolicySet
-from popl_rl.models.reward_set import RewardSet
 from popl_rl.processes import Workers
 from popl_rl.storage import write_atomic, written_beside
 
-__all__ = ["evaluate_again", "evaluation_title", "new_evaluation"]
+__all__ = ["Gathered", "evaluate_again", "evaluation_title", "gather_again", "new_evaluation"]
 
 
 def evaluate_again(
@@ -46,11 +46,52 @@ def evaluate_again(
         ValueError: If what the run has kept is damaged, or settings do not go together.
     """
     torch.set_num_threads(config.threads)
-    is_reward = (run_dir / RewardSet.folder).is_dir()
-    found = load_own_set(run_dir, (RewardSet if is_reward else PolicySet).folder)
-    kept, baselines = run_dir / "data", None
+    found, baselines = load_found_set(run_dir), None
     if config.evaluation.baselines and (run_dir / "baselines").is_dir():
         baselines = load_own_set(run_dir, "baselines")
+    world, _, evaluator = gather_again(config, run_dir, seed=seed, workers=workers)
+    ppo = None
+    if config.evaluation.ppo_reference:
+        check_ppo("evaluation.ppo_reference", world.env)
+        tell_cost(config.env, config.raters.groups, world.make)
+        ppo = ppo_policies(config.env, config.raters.groups, world.make)
+    board = evaluator.score(found, baselines, ppo=ppo, label=config.method.name)
+    about = {
+        "answers of each new rater": config.evaluation.answers,
+        "seed": seed,
+        **diagnostics(board, evaluator),
+    }
+    with new_evaluation(run_dir, evaluation=config.evaluation, seed=seed) as (folder, beside):
+        title = evaluation_title(folder)
+        report = markdown(board.results, title=title, about=about, figures=[], label=board.label)
+        write_atomic(beside / "results.csv", board.results.to_csv(index=False))
+        write_atomic(beside / "report.md", report)
+    return folder, board
+
+
+class Gathered(NamedTuple):
+    """What a run was about, once more."""
+
+    world: World
+    data: Data
+    evaluator: Evaluator
+
+
+def gather_again(
+    config: Config, run_dir: Path, *, seed: int, workers: Workers | None = None
+) -> Gathered:
+    """The world of a run, its segments and preferences, and an evaluator of them.
+
+    Args:
+        config: The run's settings.
+        run_dir: Folder of the run; what it has not kept is made or read as it was then.
+        seed: Seed of the held-out pairs, new raters and episodes.
+        workers: Processes that step the world side by side; this one if None.
+
+    Raises:
+        ValueError: If what the run has kept is damaged, or settings do not go together.
+    """
+    kept = run_dir / "data"
     world = build_world(config.env, workers=workers)
     groups = build_groups(config.raters, world)
     load, reader = (kept, None) if kept.is_dir() else given_data(config.data)
@@ -69,23 +110,7 @@ def evaluate_again(
     spec = build_spec(config.method, world.env)
     clone = load_own_set(run_dir, "clone") if (run_dir / "clone").is_dir() else None
     evaluator = make_evaluator(config, world, groups, data, spec, clone=clone, seed=seed)
-    ppo = None
-    if config.evaluation.ppo_reference:
-        check_ppo("evaluation.ppo_reference", world.env)
-        tell_cost(config.env, config.raters.groups, world.make)
-        ppo = ppo_policies(config.env, config.raters.groups, world.make)
-    board = evaluator.score(found, baselines, ppo=ppo, label=config.method.name)
-    about = {
-        "answers of each new rater": config.evaluation.answers,
-        "seed": seed,
-        **diagnostics(board, evaluator),
-    }
-    with new_evaluation(run_dir, evaluation=config.evaluation, seed=seed) as (folder, beside):
-        title = evaluation_title(folder)
-        report = markdown(board.results, title=title, about=about, figures=[], label=board.label)
-        write_atomic(beside / "results.csv", board.results.to_csv(index=False))
-        write_atomic(beside / "report.md", report)
-    return folder, board
+    return Gathered(world, data, evaluator)
 
 
 @contextmanager
