@@ -15,9 +15,8 @@ from torch import Tensor
 
 from popl_rl.algorithms.divisions import Division, merge, prediction, responsibility
 from popl_rl.algorithms.problem import Problem
-from popl_rl.models.calibration import fit_response
+from popl_rl.models.calibration import scale_for_strangers
 from popl_rl.models.population import Population
-from popl_rl.models.preference_likelihood import MISTAKE
 
 __all__ = ["Agreement", "agreements"]
 
@@ -58,13 +57,11 @@ class Agreement(NamedTuple):
             judged: Of each search the answers of the raters whom it has not learnt of.
 
         Returns:
-            The geometric mean over the searches, see ``popl_rl.models.calibration.fit_response``.
+            See ``popl_rl.models.calibration.scale_for_strangers``.
         """
-        each = [
-            fit_response(part.margins(problem), problem.comparisons, mistake=MISTAKE)[0]
-            for part, problem in zip(self.parts, judged, strict=True)
-        ]
-        return float(torch.tensor(each, dtype=torch.float64).log().mean().exp())
+        parts = zip(self.parts, judged, strict=True)
+        margins = [part.margins(problem) for part, problem in parts]
+        return scale_for_strangers(margins, [problem.comparisons for problem in judged])
 
 
 def agreements(

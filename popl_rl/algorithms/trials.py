@@ -17,8 +17,7 @@ from popl_rl.algorithms.agreement import Agreement
 from popl_rl.algorithms.divisions import prediction
 from popl_rl.algorithms.niche_members import NicheMembers
 from popl_rl.algorithms.problem import Problem
-from popl_rl.models.calibration import fit_response
-from popl_rl.models.preference_likelihood import MISTAKE
+from popl_rl.models.calibration import scale_for_strangers
 
 __all__ = ["Fold", "Trial", "trials"]
 
@@ -41,8 +40,8 @@ class Trial(NamedTuple):
     Attributes:
         value: Mean log-likelihood of the answers of each rater, each as predicted by members that
             have not learnt of them, ``[C]``.
-        scale: How much scores are to be believed by such people: the geometric mean over the folds,
-            see ``popl_rl.models.calibration.fit_response``.
+        scale: How much scores are to be believed by such people, see
+            ``popl_rl.models.calibration.scale_for_strangers``.
     """
 
     value: Tensor
@@ -86,16 +85,15 @@ def _trial(
     folds: Sequence[Fold], served: Tensor, *, generations: int, generator: torch.Generator
 ) -> Trial:
     """Fresh members for one division of the raters ``served``, ``[K, C]``, in each fold."""
-    values, scales = [], []
+    margins = []
     for learnt, judged in folds:
         members = NicheMembers(learnt, served, generator=generator)
         for generation in range(generations):
             members.step(generation, generations)
-        margin = judged.margins(members.stack)
-        values.append(prediction(margin, judged.comparisons))
-        scales.append(fit_response(margin, judged.comparisons, mistake=MISTAKE)[0])
-    scale = torch.tensor(scales, dtype=torch.float64).log().mean().exp()
-    return Trial(torch.stack(values).sum(0), float(scale))
+        margins.append(judged.margins(members.stack))
+    answers = [judged.comparisons for _, judged in folds]
+    values = [prediction(margin, own) for margin, own in zip(margins, answers, strict=True)]
+    return Trial(torch.stack(values).sum(0), scale_for_strangers(margins, answers))
 
 
 def _mean(value: Tensor) -> float:

@@ -1,5 +1,7 @@
 """How firmly a set's scores should be believed, when it is catered to a rater."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -11,7 +13,7 @@ from popl_rl.models.preference_likelihood import (
     leave_one_out,
 )
 
-__all__ = ["MISTAKES", "SCALES", "fit_response", "fit_scale"]
+__all__ = ["MISTAKES", "SCALES", "fit_response", "fit_scale", "scale_for_strangers"]
 
 #: Scales that are tried: powers of two from an eighth to 32.
 SCALES = tuple(2.0**power for power in range(-3, 6))
@@ -82,6 +84,23 @@ def fit_response(
     slip = max(MISTAKES, key=lambda one: value(scale, one)) if mistake is None else mistake
     near = (scale / 2, scale / 2**0.5, scale, scale * 2**0.5, scale * 2)
     return max(near, key=lambda one: value(one, slip)), slip
+
+
+def scale_for_strangers(margins: Sequence[Tensor], comparisons: Sequence[Comparisons]) -> float:
+    """How much scores are to be believed by people whom nobody has learnt of.
+
+    Args:
+        margins: Of each fold the margins of its members, on people of whom they have not learnt.
+        comparisons: Of each fold the answers of these people.
+
+    Returns:
+        The geometric mean over the folds, see ``fit_response``.
+    """
+    each = [
+        fit_response(margin, answers, mistake=MISTAKE)[0]
+        for margin, answers in zip(margins, comparisons, strict=True)
+    ]
+    return float(torch.tensor(each, dtype=torch.float64).log().mean().exp())
 
 
 def _evidence(margin: InParts, scale: float, comparisons: Comparisons, mistake: float) -> Tensor:
