@@ -39,7 +39,7 @@ __all__ = [
     "selection",
 ]
 
-Kind = Literal["env", "rater", "behaviour", "selection", "method", "reader"]
+Kind = Literal["env", "rater", "behaviour", "features", "selection", "method", "reader"]
 _T = TypeVar("_T", bound=Callable[..., Any])
 
 _FORMS = (

@@ -205,7 +205,7 @@ def test_a_forgotten_name_is_reported():
 
 
 def test_kind_and_type_of_a_reference_are_checked():
-    known = r"\['behaviour', 'env', 'method', 'rater', 'reader', 'selection'\]"
+    known = r"\['behaviour', 'env', 'features', 'method', 'rater', 'reader', 'selection'\]"
     with pytest.raises(ValueError, match=f"kind must be one of {known}"):
         resolve("robot", "x")
     with pytest.raises(TypeError, match="must be a string, got int"):

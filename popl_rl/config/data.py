@@ -44,6 +44,9 @@ class EnvConfig:
     # Share of behaviours in the data, by name or pattern; all alike if empty or null.
     mixture: dict[str, float] | None = field(default_factory=dict)
     id: str | None = None  # id of a Gymnasium environment, for env=gym
+    # Reference of a frozen feature extractor, file.py:attr or module:attr: what is observed are its
+    # features of what the environment shows; null for none.
+    features: str | None = None
     max_steps: int = 60  # steps after which an episode is cut
     success: str = "goal"  # number in info that is positive when the task is done
     door: str | None = None  # integer in info whose values are worth a row in the table
@@ -61,6 +64,9 @@ class EnvConfig:
             at.expect(bool(self.id), "id", name, self.id)
         if self.id is not None:
             at.expect(bool(self.id), "id", "an id, or null", self.id)
+        if self.features is not None:
+            named = "a reference, such as env.features=my.py:extract, or null"
+            at.expect(":" in self.features, "features", named, self.features)
         at.expect(all(self.behaviours), "behaviours", "references", self.behaviours)
         for name, given in (("behaviours", self.behaviours), ("noise", self.noise)):
             at.expect(len(set(given)) == len(given), name, "different from each other", given)

@@ -2,8 +2,8 @@
 
 * ``environments``: environments built from settings; ``tables``: their transitions, solved exactly;
   ``enumeration``: tables found by trying every action; ``adapters``: environments of any spaces as
-  learners take them; ``plugged``: environments of other people and what they offer, checked
-  wherever they are called.
+  learners take them; ``features``: frozen extractors of what is shown; ``plugged``: environments
+  of other people and what they offer, checked wherever they are called.
 * ``behaviours``: who acts while data are collected; ``rollouts``: whole episodes in lockstep;
   ``table_rollouts``: the same, looked up in a table; ``process_rollouts``: stepped in several
   processes.

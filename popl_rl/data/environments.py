@@ -25,6 +25,7 @@ from popl_rl.data.behaviours import (
     random_behaviour,
     table_behaviour,
 )
+from popl_rl.data.features import Extracted, with_features
 from popl_rl.data.plugged import (
     CheckedEnv,
     Collect,
@@ -81,12 +82,15 @@ class World:
 class _MakeByReference:
     """Makes an environment from a reference, in any process that it is sent to."""
 
-    def __init__(self, factory: str, env_id: str | None, options: Mapping[str, Any]) -> None:
+    def __init__(
+        self, factory: str, env_id: str | None, options: Mapping[str, Any], features: str | None
+    ) -> None:
         self.factory, self.env_id, self.options = factory, env_id, options
+        self.features = features
         self._make_env: Callable[..., gymnasium.Env[Any, Any]] = resolve("env", factory)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _MakeByReference, (self.factory, self.env_id, self.options)
+        return _MakeByReference, (self.factory, self.env_id, self.options, self.features)
 
     def __call__(self) -> gymnasium.Env[Any, Any]:
         make_env = self._make_env
@@ -103,7 +107,8 @@ class _MakeByReference:
             if isinstance(error, KeyboardInterrupt) or not is_foreign(make_env):
                 raise  # ours say in their own words which option is off
             raise failure("env", self.factory, "making it", error, make_env) from error
-        return _prepared(env, self.factory, self.factory if self.env_id is None else self.env_id)
+        name = self.factory if self.env_id is None else self.env_id
+        return _prepared(env, self.factory, name, self.features)
 
 
 def make_world(
@@ -115,6 +120,7 @@ def make_world(
     mixture: Mapping[str, float] | None = None,
     choose: Callable[["World"], Mapping[str, Behaviour]] | None = None,
     workers: Workers | None = None,
+    features: str | None = None,
 ) -> World:
     """Resolve an environment and read off what it offers.
 
@@ -133,6 +139,8 @@ def make_world(
         choose: Gives other behaviours in the place of those that the environment has, which may be
             none; None for these.
         workers: Processes that step environments side by side; this one alone if None.
+        features: Reference of a frozen extractor whose features are observed in the place of what
+            the environment shows, see ``popl_rl.data.features``; None for none.
 
     Raises:
         ValueError: If the environment cannot be resolved or built, what it offers makes no sense,
@@ -141,12 +149,14 @@ def make_world(
             ``popl_rl.data.behaviours.random_behaviour``.
     """
     own = dict(options or {})
-    make = _MakeByReference(factory, env_id, own)
-    make_for_data = _MakeByReference(factory, env_id, {**own, **(data_options or {})})
+    make = _MakeByReference(factory, env_id, own, features)
+    make_for_data = _MakeByReference(factory, env_id, {**own, **(data_options or {})}, features)
     env = make()
     space, first = env.action_space, first_action(env.action_space)
     native = native_spaces(env)[1]
     table = checked_table(offered(env, "transition_table"), factory)
+    if table is not None and features is not None:
+        table = with_features(table, env)
     given = checked_behaviours(offered(env, "behaviours"), factory)
     behaviours: Mapping[str, Behaviour] = {
         name: table_behaviour(what, first=first)
@@ -156,6 +166,11 @@ def make_world(
     }
     collect = None
     if offered(env, "collect_segments") is not None:
+        if features is not None:
+            raise ValueError(
+                f"env.features must be left out, since {factory!r} collects segments itself; let "
+                "collect_segments() and its observations give the features"
+            )
         collect = checked_collect(offered(make_for_data(), "collect_segments"), factory)
     world = World(make, make_for_data, env, behaviours, {}, table, collect, workers)
     if choose is not None:
@@ -166,13 +181,14 @@ def make_world(
     return replace(world, behaviours=behaviours, shares=shares)
 
 
-def _prepared(env: Any, factory: str, name: str) -> gymnasium.Env[Any, Any]:
+def _prepared(env: Any, factory: str, name: str, features: str | None) -> gymnasium.Env[Any, Any]:
     """What a factory has returned, checked, adapted, and with actions clipped to their bounds."""
     try:
         env = as_gymnasium(env)
         if not isinstance(env, gymnasium.Env):
             raise ValueError(f"must return a gymnasium.Env or a TorchRL EnvBase, got {type(env)}")
-        made = CheckedEnv(adapted(env), name)
+        seen = env if features is None else Extracted(env, features)
+        made = CheckedEnv(adapted(seen), name)
     except (TypeError, ValueError) as error:
         raise type(error)(f"env.factory {factory!r}: {error}") from error
     space = made.action_space

@@ -80,6 +80,7 @@ def build_world(config: EnvConfig, *, workers: Workers | None = None) -> World:
         mixture=config.mixture,
         choose=partial(chosen_behaviours, config) if is_chosen else None,
         workers=workers,
+        features=config.features,
     )
 
 
@@ -191,9 +192,9 @@ def describe(env: EnvConfig, config: DataConfig, *, seed: int) -> dict[str, Any]
     described: Any = OmegaConf.to_container(node, resolve=True)
     described["mixture"] = described["mixture"] or None  # both are equal shares
     # Of what most worlds leave as it is, the ids of stored segments know nothing.
-    chosen: dict[str, Any] = {}
+    chosen: dict[str, Any] = {} if env.features is None else {"features": env.features}
     if env.behaviours or list(env.noise) != [0.0]:
-        chosen = {name: described[name] for name in ("behaviours", "noise")}
+        chosen |= {name: described[name] for name in ("behaviours", "noise")}
         chosen |= {"policies": policy_digests(env)}
         if ppo_raters(env):
             chosen["ppo"] = {k: v for k, v in described["ppo"].items() if k != "store"}

@@ -107,6 +107,8 @@ def _folder(env: EnvConfig, rater: str) -> Path:
     described: Any = OmegaConf.to_container(node, resolve=True)
     about = {name: described[name] for name in ("factory", "id", "options", "max_steps")}
     about |= {"format": 1, "rater": rater, "hidden": list(_HIDDEN)}
+    if env.features is not None:
+        about["features"] = env.features
     about["ppo"] = {name: value for name, value in described["ppo"].items() if name != "store"}
     about["plug_ins"] = plug_in_digests(about)
     name = "-".join(filter(None, (env.factory.rpartition(":")[2], env.id, rater)))

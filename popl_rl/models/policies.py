@@ -17,6 +17,7 @@ from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor
 from popl_rl.data.adapters import is_image, native_spaces
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.behaviours import first_action
+from popl_rl.data.features import extractor, feature_source
 from popl_rl.keys import ACTION, OBSERVATION
 from popl_rl.models.convolutions import image_layers
 
@@ -87,6 +88,9 @@ class PolicySpec:
             where the network begins with convolutions; else empty.
         channels: Outputs of each convolution, see ``popl_rl.models.convolutions``.
         image_scale: What pixels are divided by.
+        features: Reference of the frozen extractor whose features are observed, see
+            ``popl_rl.data.features``; empty without one.
+        shown: Shape of what it reads; empty without one.
     """
 
     observation_dim: int
@@ -98,6 +102,8 @@ class PolicySpec:
     image: tuple[int, ...] = ()
     channels: tuple[int, ...] = ()
     image_scale: float = 1.0
+    features: str = ""
+    shown: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("observation_dim", "action_dim"):
@@ -158,6 +164,8 @@ class PolicySpec:
             )
         first = first_action(action)
         spec = cls(observation.shape[0], size, discrete, tuple(hidden), action_std, first)
+        features, shown = feature_source(env)
+        spec = replace(spec, features=features, shown=shown)
         native = native_spaces(env)[0]
         if not channels or not is_image(native):
             return spec
@@ -165,6 +173,42 @@ class PolicySpec:
         scale = high if 0 < high < np.inf else 1.0
         shape = tuple(int(length) for length in native.shape or ())
         return replace(spec, image=shape, channels=tuple(channels), image_scale=scale)
+
+    def seen(self, observation: Tensor) -> Tensor:
+        """Features of what the environment shows, as the networks read them.
+
+        Args:
+            observation: ``[..., *shown]``, such as images ``[..., H, W, C]`` uint8.
+
+        Returns:
+            ``[..., O]``; what is given where there is no extractor.
+
+        Raises:
+            ValueError: If the shape is another, the extractor cannot be found, or it gives features
+                of another length.
+        """
+        if not self.features:
+            return observation
+        if observation.shape[-len(self.shown) :] != self.shown:
+            raise ValueError(
+                f"observation must have shape [..., {', '.join(map(str, self.shown))}], as the "
+                f"environment shows it, got {list(observation.shape)}"
+            )
+        try:
+            extract = extractor(self.features)
+        except ValueError as error:
+            raise ValueError(
+                f"these policies act on {self.observation_dim} features, whose extractor cannot be "
+                f"found: {error} Bring it back, or give them features"
+            ) from error
+        before = observation.shape[: observation.ndim - len(self.shown)]
+        read = extract(observation.reshape(-1, *self.shown).cpu()).to(observation.device)
+        if read.shape[1] != self.observation_dim:
+            raise ValueError(
+                f"features {self.features!r} must be {self.observation_dim} numbers, as when these "
+                f"policies were trained, got {read.shape[1]}"
+            )
+        return read.view(*before, -1)
 
     @property
     def refines(self) -> bool:

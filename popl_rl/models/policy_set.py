@@ -46,7 +46,9 @@ class PolicySet(HypothesisSet):
 
         Args:
             observation: ``[O]`` or ``[B, O]``; without ``member`` also ``[N, B, O]``, each policy
-                its own.
+                its own. Where policies act on features (``env.features``), images of uint8 as the
+                environment shows them, ``[H, W, C]`` or ``[B, H, W, C]``, will do; what is shown
+                and not uint8 has to be given to ``population.spec.seen`` first.
             member: Whose actions; every policy's if None.
             greedy: Take the most likely action rather than sample. Continuous policies always
                 give their mean.
@@ -58,8 +60,12 @@ class PolicySet(HypothesisSet):
 
         Raises:
             IndexError: If there is no such member.
-            ValueError: If it must sample without a generator.
+            ValueError: If it must sample without a generator, or the extractor of the features
+                cannot be found.
         """
+        spec = cast("PolicySpec", self.population.spec)
+        if observation.dtype == torch.uint8:
+            observation = spec.seen(observation)
         single = observation.ndim == 1
         batch = observation.unsqueeze(0) if single else observation
         if member is None:
@@ -68,7 +74,6 @@ class PolicySet(HypothesisSet):
             if not 0 <= member < len(self):
                 raise IndexError(f"member must be in 0..{len(self) - 1}, got {member}")
             output = self.population.subset([member])(batch)[0]
-        spec = cast("PolicySpec", self.population.spec)
         if not spec.discrete:
             action = output
         elif greedy:

@@ -1,6 +1,7 @@
 """`popl-train` where observations are images: both groups are told apart by what is seen."""
 
 import pytest
+import torch
 
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.storage import load_tensordict
@@ -39,6 +40,21 @@ def right(segments):
 """
 
 
+EXTRACT = """
+import torch
+
+
+class Rows(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.layer = torch.nn.Linear(8, 6)
+
+    def forward(self, images):
+        assert images.dtype == torch.uint8 and images.shape[1:] == (8, 8, 3)
+        return self.layer(images[:, 3, :, 0] / 255)
+"""
+
+
 @pytest.mark.slow  # a whole run, of several seconds
 def test_members_with_convolutions_serve_both_groups(config_of, tiny, tmp_path):
     file = tmp_path / "walk.py"
@@ -68,3 +84,44 @@ def test_members_with_convolutions_serve_both_groups(config_of, tiny, tmp_path):
     assert policies.population.spec.channels == (4,)
     seen = load_tensordict(tmp_path / "run" / "data" / "segments")["observation"]
     assert policies.act(seen[:5, 0], greedy=True).shape == (len(policies), 5)
+
+
+@pytest.mark.slow  # a whole run, of several seconds
+def test_members_act_on_features_and_serve_both_groups(config_of, tiny, tmp_path):
+    (tmp_path / "eyes.py").write_text(EXTRACT)
+    file = tmp_path / "walk.py"
+    file.write_text(WALK)
+    config = config_of(
+        *tiny[1:],
+        "env=custom",
+        f"env.factory={file}:Walk",
+        f"env.features={tmp_path / 'eyes.py'}:Rows",
+        f"raters.groups=['{file}:left','{file}:right']",
+        "raters.label=return",
+        "env.success=",
+        "method.hidden=[16]",
+        "method.training.steps=200",
+        "method.training.learning_rate=0.005",
+        "method.refinement.steps=200",
+        "raters.answers=30",
+        f"run_dir={tmp_path / 'run'}",
+    )
+    board = run(config).board
+    for group in ("left", "right"):
+        got, floor = (board.value(method, group, "return") for method in ("popl", "random"))
+        assert got > floor + 40  # of some 60
+    seen = load_tensordict(tmp_path / "run" / "data" / "segments")["observation"]
+    assert seen.shape[2:] == (6,)  # segments hold features alone
+    policies = PolicySet.load(tmp_path / "run" / "policies")
+    assert policies.population.spec.shown == (8, 8, 3)
+    assert not policies.population.spec.image
+    images = torch.zeros(8, 8, 8, 3, dtype=torch.uint8)  # the walker in each of the eight places
+    for place in range(8):
+        images[place, 3:5, place, :2] = 255
+    features = policies.population.spec.seen(images)
+    shown = torch.cat([features, seen.flatten(0, 1)]).unique(dim=0)
+    assert len(shown) <= 9  # the same eight features as in the data, and padding at most
+    greedy = policies.act(images, greedy=True)
+    assert torch.equal(greedy, policies.act(features, greedy=True))
+    assert greedy.shape == (len(policies), 8)
+    assert policies.act(images[0], member=0, greedy=True).shape == ()
