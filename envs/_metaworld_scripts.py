@@ -19,6 +19,7 @@ __all__ = ["ANCHOR_SPEED", "Scripted", "script"]
 #: An action of 1 moves the hand's anchor by 1 cm in 12.5 ms, in m/s.
 ANCHOR_SPEED = 0.8
 _PUSH_STEPS = 10
+_OPEN, _CLOSE = -1.0, 1.0  # what the gripper is told
 
 
 class Scripted:
@@ -107,8 +108,8 @@ def script(task: str) -> Callable[[Array], Array]:
         ValueError: If there is no such task.
     """
     name = task_name(task)
-    if name == "door-open-v3":
-        return _open_door
+    if name in _OWN:
+        return _OWN[name]
     make: Any = ENV_POLICY_MAP[name]
     policy = make()
 
@@ -138,4 +139,51 @@ def _open_door(observation: Array) -> Array:
         target = behind
     else:
         target = behind + np.array([0.0, 0.0, 0.2])
-    return np.append(np.clip(25 * (target - hand), -1, 1), 1.0)
+    return _hand(hand, target, _CLOSE)
+
+
+def _sweep_into(observation: Array) -> Array:
+    """Come down on the block, hold it, then drag it into the hole.
+
+    Metaworld's own script closes the gripper 15 cm above the block: slowly, it arrives closed.
+    """
+    hand, block, hole = observation[:3], observation[4:7], observation[-3:]
+    grasp = block + np.array([-0.005, 0.0, 0.01])
+    beside = float(np.linalg.norm(hand[:2] - grasp[:2]))
+    height = hand[2] - grasp[2]
+    is_down = height < 0.04 and beside < 0.06  # the block lags a little while it is dragged
+    if beside > 0.04 and not is_down:
+        return _hand(hand, grasp + np.array([0.0, 0.0, 0.2]), _OPEN)
+    if height > 0.03:
+        return _hand(hand, grasp, _OPEN)
+    return _hand(hand, grasp if observation[3] > 0.7 else hole, _CLOSE)
+
+
+def _insert_peg(observation: Array) -> Array:
+    """Come down on the peg, hold it, lift it before the hole, then push it in.
+
+    Metaworld's own script closes the gripper on the way down, as above, and leaves without
+    waiting for the peg.
+    """
+    hand, peg = observation[:3], observation[4:7]
+    hole = np.array([-0.35, observation[-2], 0.16])  # behind it, so that nothing slows down
+    if float(np.linalg.norm(hand[:2] - peg[:2])) > 0.04:
+        return _hand(hand, peg + np.array([0.0, 0.0, 0.3]), _OPEN)
+    if abs(hand[2] - peg[2]) > 0.025:
+        return _hand(hand, peg, _OPEN)
+    if observation[3] > 0.5:
+        return _hand(hand, peg, _CLOSE)
+    is_before = float(np.linalg.norm(peg[1:] - hole[1:])) <= 0.03
+    return _hand(hand, hole if is_before else hole + np.array([0.4, 0.0, 0.0]), _CLOSE)
+
+
+def _hand(hand: Array, target: Array, grip: float) -> Array:
+    """The action ``[4]`` that moves the hand to a place."""
+    return np.append(np.clip(25 * (target - hand), -1, 1), grip)
+
+
+_OWN = {
+    "door-open-v3": _open_door,
+    "peg-insert-side-v3": _insert_peg,
+    "sweep-into-v3": _sweep_into,
+}
