@@ -6,5 +6,6 @@
 * ``cartpole``: Gymnasium's CartPole, the smallest continuous world.
 * ``reacher``: MuJoCo's Reacher, quick or smooth.
 * ``hopper``: MuJoCo's Hopper, fast or upright.
+* ``half_cheetah``: MuJoCo's HalfCheetah, fast or with little effort.
 * ``metaworld_tasks``: a robot arm at fifty tasks.
 """
