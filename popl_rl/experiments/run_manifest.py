@@ -56,11 +56,14 @@ def write_run_manifest(run_dir: Path, config: Any) -> None:
 
     Args:
         run_dir: Folder of the run.
-        config: Its settings, as ``config.yaml`` is going to say them.
+        config: Its settings, as ``config.yaml`` is going to say them: a DictConfig, dataclass or
+            dict.
 
     Raises:
         OSError: If it cannot be written.
     """
+    if not OmegaConf.is_config(config):
+        config = OmegaConf.create(config)
     content = {
         "format": _FORMAT,
         "run": uuid.uuid4().hex,

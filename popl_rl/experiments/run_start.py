@@ -69,8 +69,9 @@ def _new_run(config: Config, command: Sequence[str]) -> Iterator[Path]:
     """Make the folder of a run, and hold it."""
 
     def fill(folder: Path) -> None:
-        write_run_manifest(folder, config)
-        save_config(folder, config)
+        settings = OmegaConf.structured(config)  # once for both
+        write_run_manifest(folder, settings)
+        save_config(folder, settings)
         write_metadata(folder, command=command)
 
     name = f"{config.method.name}-seed{config.seed}"

@@ -7,6 +7,7 @@ import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 
+from popl_rl.config import Config, RatersConfig
 from popl_rl.experiments.run_folder import create_run_dir, save_config
 from popl_rl.experiments.run_manifest import (
     check_own,
@@ -57,6 +58,13 @@ def test_settings_come_back_as_they_were(tmp_path, plug_in):
     assert is_run_of(run, CONFIG)
     assert not is_run_of(run, {**CONFIG, "seed": 4})
     assert not is_run_of(tmp_path, CONFIG)
+
+
+def test_settings_may_be_a_dataclass(tmp_path, plug_in):
+    raters = RatersConfig(groups=["raters_of_mine.py:likes(3)", "upper"])
+    run = begin(tmp_path / "run", Config(raters=raters))
+    assert (run / "plug_ins" / "0" / "shared.py").is_file()
+    assert load_run_config(run).raters.groups == raters.groups
 
 
 def test_settings_that_were_changed_are_refused(tmp_path, plug_in):
