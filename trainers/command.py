@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -173,6 +174,7 @@ def given_overrides() -> list[str]:
     return [str(override) for override in HydraConfig.get().overrides.task]
 
 
+@cache
 def _readers() -> dict[str, list[str]]:
     """Sections that each shipped method reads, by its name."""
     found = {}

@@ -32,6 +32,7 @@ class EvaluationConfig:
     reward_baselines: bool = True  # B-REX and DPL too, where items are judged
     brex_steps: int = 10_000  # steps of B-REX's chain
     dpl_steps: int = 500  # steps of DPL's training
+    figures: bool = True  # draw pictures
     animate: bool = False  # an animated GIF for each group, where there is a renderer
     # Answers up to which the method is trained on fewer of them too, to tell how many are missing;
     # 0 for never.

@@ -175,10 +175,7 @@ def finish_people(
     *,
     title: str,
 ) -> pd.DataFrame:
-    """Write ``people.csv``, ``results.csv``, the figure and the report; return the results."""
-    from popl_rl.plotting.people_plots import people_curves  # matplotlib only where it draws
-    from popl_rl.plotting.style import save
-
+    """Write ``people.csv``, ``results.csv``, the report and, if any, the figure; give results."""
     write_atomic(run_dir / "people.csv", table.to_csv(index=False))
     references = [("pooled_cpl", ""), ("individual", ""), ("popl", "single")]
     results = summarise_people(table, references=references, seed=config.seed)
@@ -203,9 +200,18 @@ def finish_people(
         summary=summarise(people.data).lines(),
     )
     report(figures=[])
-    figure = run_dir / "figures" / "people.png"
-    with accessory("there is no picture of the results", "the report has all numbers"):
-        figure.parent.mkdir(exist_ok=True)
-        save(people_curves(results), figure)
-        report(figures=[Path("figures") / figure.name])
+    if config.evaluation.figures:
+        with accessory("there is no picture of the results", "the report has all numbers"):
+            report(figures=[_draw_people(results, run_dir)])
     return results
+
+
+def _draw_people(results: pd.DataFrame, run_dir: Path) -> Path:
+    """Draw the curves over answers, and tell where, from the run's folder."""
+    from popl_rl.plotting.people_plots import people_curves  # matplotlib only where it draws
+    from popl_rl.plotting.style import save
+
+    path = Path("figures", "people.png")
+    (run_dir / path.parent).mkdir(exist_ok=True)
+    save(people_curves(results), run_dir / path)
+    return path

@@ -1,11 +1,9 @@
 """The steps of a training run, in the order in which ``trainers/train_popl.py`` takes them."""
 
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
-
-from omegaconf import OmegaConf
 
 from popl_rl.algorithms.problem import Method, Problem
 from popl_rl.algorithms.reward_baselines import RewardBaselines, train_reward_baselines
@@ -159,9 +157,8 @@ def gather(config: Config, run_dir: Path, place: Place) -> Setting:
 
 def open_logger(config: Config, run_dir: Path) -> AbstractContextManager[RunLogger]:
     """Where the run reports to while it goes on."""
-    settings: Any = OmegaConf.to_container(OmegaConf.structured(config), resolve=True)
     name: Any = config.logger.name
-    return make_logger(name, run_dir, project=config.logger.project, config=settings)
+    return make_logger(name, run_dir, project=config.logger.project, config=asdict(config))
 
 
 def build(config: Config, setting: Setting) -> Method:
@@ -271,7 +268,9 @@ def draw(
     board: Scoreboard,
     run_dir: Path,
 ) -> dict[str, Path]:
-    """Every picture that the run has the data for."""
+    """Every picture that the run has the data for; none with ``evaluation.figures=false``."""
+    if not config.evaluation.figures:
+        return {}
     from popl_rl.plotting import run_figures  # matplotlib only where figures are drawn
 
     return run_figures.draw(

@@ -23,11 +23,23 @@ PALETTE = {
 }
 """Colours that stay apart for colour-blind readers (Okabe and Ito, 2008), and a grey."""
 
+_DPI = 120
+
 
 def save(fig: Figure, path: Path) -> None:
-    """Write a figure as a PNG of 120 dots per inch, whole or not at all."""
+    """Write a figure as a PNG of 120 dots per inch, whole or not at all.
+
+    Its layout is settled by this: later changes are not laid out anew.
+    """
+    fig.set_dpi(_DPI)
+    layout = fig.get_layout_engine()
+    if layout is not None:
+        # Matplotlib draws everything once more to lay it out while it saves; placed before, it is
+        # drawn once.
+        layout.execute(fig)
+        fig.set_layout_engine("none")
     png = io.BytesIO()
-    fig.savefig(png, format="png", dpi=120)
+    fig.savefig(png, format="png", dpi=_DPI)
     write_atomic(path, png.getvalue())
 
 
