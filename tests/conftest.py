@@ -1,5 +1,7 @@
 """Small things that many tests need; the world is the line of five cells of popl_rl.testing."""
 
+import gc
+
 import pytest
 import torch
 from hydra import compose, initialize_config_module
@@ -23,6 +25,8 @@ from popl_rl.raters.people import Raters
 from popl_rl.testing import likes_left, likes_right, tiny_env
 from popl_rl.trainers.typed import opened
 
+gc.disable()  # until everything is imported, of which nothing is garbage
+
 # How long an example takes says how busy the machine is.
 settings.register_profile("popl_rl", deadline=None)
 settings.load_profile("popl_rl")
@@ -32,6 +36,7 @@ torch.set_num_threads(1)
 
 # A run of the whole trainer in a few seconds, long enough for oracles to beat random actions.
 TINY = [
+    "evaluation.figures=false",
     "env.max_steps=20",
     "method.generations=3",
     "method.members=4",
@@ -59,6 +64,12 @@ def pytest_addoption(parser):
         action="store_true",
         help="rewrite tests/golden/*.json with what the tests now get",
     )
+
+
+def pytest_collection_finish():
+    """Leave what was imported out of every garbage collection: a million objects that stay."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(autouse=True)

@@ -1,5 +1,7 @@
 """Segments of Metaworld's tasks, up to a whole run."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -8,6 +10,7 @@ from popl_rl.data.segments import collect_segments
 from popl_rl.envs._metaworld_data import collect_continuations
 from popl_rl.envs.metaworld_tasks import MetaworldTask, metaworld
 from popl_rl.models.policy_set import PolicySet
+from popl_rl.raters.values import fit_value
 from popl_rl.trainers.train_popl import run
 
 
@@ -87,6 +90,7 @@ def test_a_run_from_segments_to_animations(config_of, tmp_path, monkeypatch):
         MetaworldTask, "render", lambda env: picture + np.uint8(env.get_state().time % 250)
     )
     monkeypatch.setattr("popl_rl.envs._metaworld_task.check_scripted", lambda *_, **__: {})
+    monkeypatch.setattr("popl_rl.raters.values.fit_value", partial(fit_value, steps=5))
     overrides = (
         "env=metaworld/button_press",
         "env.max_steps=90",
@@ -106,6 +110,7 @@ def test_a_run_from_segments_to_animations(config_of, tmp_path, monkeypatch):
         "evaluation.episodes=2",
         "evaluation.new_raters=2",
         "evaluation.answers=5",
+        "evaluation.learning_curve=0",
         "logger=csv",
     )
     result = run(config_of(*overrides, f"run_dir={tmp_path / 'run'}"))
@@ -130,6 +135,7 @@ def test_a_run_from_segments_to_animations(config_of, tmp_path, monkeypatch):
     (store,) = (tmp_path / "store").glob("metaworld-button-press-*")
     kept = [path for path in store.rglob("*") if path.is_file() and path.suffix != ".lock"]
     before = {path: path.stat().st_mtime_ns for path in kept}
-    again = run(config_of(*overrides, f"run_dir={tmp_path / 'again'}"))
+    undrawn = ("evaluation.figures=false", f"run_dir={tmp_path / 'again'}")
+    again = run(config_of(*overrides, *undrawn))
     assert again.board.results.equals(table)
     assert {path: path.stat().st_mtime_ns for path in kept} == before

@@ -1,6 +1,6 @@
 """The command ``python -m popl_rl.testing``."""
 
-import subprocess
+import runpy
 import sys
 
 import pytest
@@ -32,11 +32,15 @@ def test_command_line_misuse(arguments, capsys):
     assert "usage: python -m popl_rl.testing" in capsys.readouterr().err
 
 
-def test_module_runs():
-    command = [sys.executable, "-m", "popl_rl.testing", "env", "popl_rl.testing:tiny_env"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout == "env popl_rl.testing:tiny_env: all checks passed\n"
+def test_module_runs(monkeypatch, capsys):
+    monkeypatch.delitem(sys.modules, "popl_rl.testing.__main__", raising=False)
+    monkeypatch.setattr(sys, "argv", ["testing", "env", "popl_rl.testing:tiny_env"])
+    with pytest.raises(SystemExit) as left:
+        runpy.run_module("popl_rl.testing", run_name="__main__")
+    assert left.value.code == 0
+    said = capsys.readouterr()
+    assert said.out == "env popl_rl.testing:tiny_env: all checks passed\n"
+    assert said.err == ""
 
 
 @pytest.mark.parametrize(

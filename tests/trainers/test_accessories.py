@@ -54,6 +54,7 @@ OWN = [
     "env.factory=bare.py:Bare",
     "raters.groups=[bare.py:left,bare.py:right]",
     "raters.label=return",
+    "evaluation.figures=true",
     "evaluation.animate=true",
 ]
 
@@ -95,7 +96,7 @@ def test_pictures_that_fail_leave_the_others_and_a_report(tmp_path, tiny, config
 
     monkeypatch.setattr(run_figures, "recovery_bars", broken)
     with pytest.warns(UserWarning, match=r"no picture of recovery \(ImportError: no fonts\)"):
-        train_popl.run(config_of(*tiny, f"run_dir={tmp_path / 'run'}"))
+        train_popl.run(config_of(*tiny, "evaluation.figures=true", f"run_dir={tmp_path / 'run'}"))
     report = (tmp_path / "run" / "report.md").read_text()
     assert "occupancy.png" in report
     assert "recovery.png" not in report

@@ -55,7 +55,7 @@ def train(call, tiny):
 def finished(tmp_path_factory, tiny, config_of):
     """A finished run; not to be changed."""
     folder = tmp_path_factory.mktemp("finished") / "run"
-    train_popl.run(config_of(*tiny, f"run_dir={folder}"))
+    train_popl.run(config_of(*tiny, "evaluation.figures=true", f"run_dir={folder}"))
     return folder
 
 

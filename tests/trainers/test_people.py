@@ -26,6 +26,7 @@ SHORT = [
     "people.folds=3",
     "people.curve=[0,5]",
     "people.most_groups=2",
+    "evaluation.figures=false",
     "logger=csv",
 ]
 
@@ -119,7 +120,8 @@ def test_export_keeps_who_answered(imported, tmp_path, capsys):
 def finished(config_of, imported, tmp_path_factory):
     """A run that has learnt from the people."""
     run_dir = tmp_path_factory.mktemp("finished") / "run"
-    return run(config_of(*SHORT, f"data.load={imported}", f"run_dir={run_dir}"))
+    drawn = "evaluation.figures=true"
+    return run(config_of(*SHORT, drawn, f"data.load={imported}", f"run_dir={run_dir}"))
 
 
 def test_a_run_learns_from_people_and_tells_them_apart(finished, capsys):
@@ -192,6 +194,7 @@ def test_methods_are_compared_and_a_killed_comparison_goes_on(config_of, importe
         f"data.load={imported}",
         f"run_dir={tmp_path / 'run'}",
         "people.methods=[popl,em,vpl,lore]",
+        "people.folds=2",
     ]
     config = config_of(*SHORT[1:], *more, name="people")
     result = judge_people.run(config)

@@ -54,7 +54,7 @@ def train(tmp_path_factory, tiny, config_of):
 
 @pytest.fixture(scope="module")
 def result(train):
-    return train()
+    return train("evaluation.figures=true")
 
 
 def tensors(policies):
@@ -149,7 +149,8 @@ def test_the_seed_decides_everything(result, train):
     again = train()
     assert equal(again.policies, result.policies)
     assert again.board.results.equals(result.board.results)
-    assert not equal(train("seed=1").policies, result.policies)
+    other = train("seed=1", "evaluation.baselines=false", "evaluation.episodes=2")
+    assert not equal(other.policies, result.policies)
 
 
 def test_data_of_an_earlier_run_gives_the_same_policies(result, train):
@@ -174,7 +175,7 @@ def test_the_report_tells_how_new_raters_are_met(result):
 
 
 def test_without_baselines(train):
-    result = train("evaluation.baselines=false")
+    result = train("evaluation.baselines=false", "evaluation.figures=true")
     assert set(result.board.results.method) == {"popl", "random", *IN_ANY_CASE}
     assert not (result.run_dir / "baselines").exists()
     assert (result.run_dir / "report.md").is_file()
@@ -182,7 +183,10 @@ def test_without_baselines(train):
 
 def test_an_oracle_no_better_than_random_leaves_recovery_open(train):
     """Nobody reaches the goal in three steps, so all policies are worth the same."""
-    result = train("env.max_steps=3", "data.length=3", "evaluation.episodes=2")
+    short = ("env.max_steps=3", "data.length=3", "evaluation.episodes=2")
+    result = train(*short, "evaluation.figures=true")
+    pictures = {path.stem for path in (result.run_dir / "figures").iterdir()}
+    assert {"learning", "members", "recovery"} <= pictures
     assert (result.run_dir / "report.md").is_file()
 
 
@@ -204,18 +208,19 @@ def test_mixtures_without_rater_ids(train, capsys):
 
 
 @pytest.mark.parametrize(
-    ("method", "label", "found"),
+    ("method", "label", "found", "draws"),
     [
-        ("cpl", "cpl", PolicySet),
-        ("multi_cpl", "multi_cpl", PolicySet),
-        ("em", "em", PolicySet),
-        ("vpl", "vpl", EncodedPolicySet),
-        ("popl_tournament", "popl_tournament", PolicySet),
-        ("popl_nsga2", "popl_nsga2", PolicySet),
+        ("cpl", "cpl", PolicySet, True),
+        ("multi_cpl", "multi_cpl", PolicySet, False),
+        ("em", "em", PolicySet, False),
+        ("vpl", "vpl", EncodedPolicySet, True),
+        ("popl_tournament", "popl_tournament", PolicySet, False),
+        ("popl_nsga2", "popl_nsga2", PolicySet, True),
     ],
 )
-def test_methods_to_compare_with(train, method, label, found):
-    result = train(f"method={method}", "evaluation.episodes=4")
+def test_methods_to_compare_with(train, method, label, found, draws):
+    figures = f"evaluation.figures={str(draws).lower()}"
+    result = train(f"method={method}", "evaluation.episodes=4", figures)
     assert type(result.policies) is found
     results = result.board.results
     assert set(results.method) == {label, "pooled_cpl", "oracle", "random", *IN_ANY_CASE}
@@ -226,9 +231,12 @@ def test_methods_to_compare_with(train, method, label, found):
     assert set(pd.read_csv(result.run_dir / "history.csv").generation) == {1, 3}
     report = (result.run_dir / "report.md").read_text()
     assert report.startswith("# POPL: ") == (label == "popl")
-    pictures = {path.stem for path in (result.run_dir / "figures").iterdir()}
-    assert {"learning", "members", "occupancy"} <= pictures
-    assert ("selection" in pictures) == method.startswith("popl")
+    if draws:
+        pictures = {path.stem for path in (result.run_dir / "figures").iterdir()}
+        assert {"learning", "members", "occupancy"} <= pictures
+        assert ("selection" in pictures) == method.startswith("popl")
+    else:
+        assert not (result.run_dir / "figures").exists()
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
@@ -241,6 +249,8 @@ def test_any_gymnasium_environment_with_raters_from_a_file(train, tmp_path):
     file = tmp_path / "my_raters.py"
     file.write_text(RATERS)
     result = train(*GYM, f"raters.groups=['{file}:slow','{file}:upright']")
+    kept = result.run_dir / "plug_ins" / "0" / "my_raters.py"
+    assert kept.read_text() == RATERS
     groups = set(result.board.results.group) - {"all"}
     assert len(groups) == 2
     assert all(math.isfinite(result.board.value("popl", group, "return")) for group in groups)

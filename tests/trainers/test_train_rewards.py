@@ -28,6 +28,7 @@ STATELESS = [
     "evaluation.brex_steps=100",
     "evaluation.dpl_steps=20",
     "evaluation.learning_curve=0",
+    "evaluation.figures=false",
     "logger=csv",
 ]
 
@@ -43,7 +44,7 @@ def train(config_of, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def result(train):
-    return train()
+    return train("evaluation.figures=true")
 
 
 def same(one, other):
@@ -88,7 +89,7 @@ def test_pictures_of_utilities(result):
 
 
 def test_a_cycle_is_drawn_and_told(train):
-    result = train("raters=cycle", "raters.count=12")
+    result = train("raters=cycle", "raters.count=12", "evaluation.figures=true")
     assert (result.run_dir / "figures" / "majority.png").is_file()
     assert "prefers in a circle" in (result.run_dir / "report.md").read_text()
 
@@ -97,7 +98,8 @@ def test_the_seed_decides_everything(result, train):
     again = train()
     assert same(again.policies, result.policies)
     assert again.board.results.equals(result.board.results)
-    assert not same(train("seed=1").policies, result.policies)
+    other = train("seed=1", "evaluation.baselines=false", "evaluation.reward_baselines=false")
+    assert not same(other.policies, result.policies)
 
 
 def test_a_finished_run_is_judged_again(result, config_of, tmp_path):
@@ -119,10 +121,13 @@ def test_other_ways_of_learning_them(train, overrides):
 
 
 def test_features_trained_on_everybody(train):
-    result = train(
-        "method.evolve=head", "method.popl.features=pooled", "method.popl.pooled_steps=20"
+    heads = (
+        "method.evolve=head",
+        "evaluation.baselines=false",
+        "evaluation.reward_baselines=false",
     )
-    plain = train("method.evolve=head")
+    result = train(*heads, "method.popl.features=pooled", "method.popl.pooled_steps=20")
+    plain = train(*heads)
     trunks = [r.policies.population.trunk.state_dict()["0.weight"] for r in (result, plain)]
     assert not torch.equal(*trunks)
 
@@ -133,8 +138,8 @@ def test_there_is_no_policy_to_learn(train):
 
 
 def test_rewards_of_two_doors_are_planned_for(config_of, tiny, tmp_path):
-    overrides = [*tiny, "method.learns=reward", f"run_dir={tmp_path / 'run'}"]
-    result = train_popl.run(config_of(*overrides))
+    overrides = [*tiny, "method.learns=reward", "evaluation.figures=true"]
+    result = train_popl.run(config_of(*overrides, f"run_dir={tmp_path / 'run'}"))
     assert isinstance(result.policies, RewardSet)
     assert (result.run_dir / "figures" / "occupancy.png").is_file()
     # Planning reaches the goal whatever the reward says of the doors.
