@@ -14,7 +14,7 @@ from torch import Tensor
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.evaluation.measures import new_rater_answers
 from popl_rl.keys import RATER
-from popl_rl.models.preference_likelihood import log_likelihood, per_case
+from popl_rl.models.preference_likelihood import InParts, log_likelihood, per_case
 from popl_rl.models.scoring import case_values
 from popl_rl.raters.groups import RaterGroup
 from popl_rl.raters.pairs import PairPool
@@ -88,7 +88,7 @@ def favourites(margin: Tensor, comparisons: Comparisons) -> Tensor:
     return per_case(log_likelihood(margin), comparisons).argmax(0)
 
 
-def met_answers(margin: Tensor, comparisons: Comparisons) -> Tensor:
+def met_answers(margin: Tensor | InParts, comparisons: Comparisons) -> Tensor:
     """Share of each rater's answers that are ranked right by what the other half of them chooses.
 
     Args:
@@ -98,14 +98,21 @@ def met_answers(margin: Tensor, comparisons: Comparisons) -> Tensor:
     Returns:
         ``[C]``.
     """
-    passes = margin > 0
+    margins = InParts.of(margin)
     half = torch.arange(len(comparisons)) % 2
-    met = torch.zeros(len(comparisons), dtype=torch.bool)
-    for chosen_by in (0, 1):
-        asked, further = (half == chosen_by).nonzero()[:, 0], (half != chosen_by).nonzero()[:, 0]
-        favourite = favourites(margin[:, asked], comparisons.rows(asked))
-        met[further] = passes[favourite[comparisons.case[further]], further]
-    return case_values(met.unsqueeze(0), comparisons)[0]
+    belief = torch.zeros(2, margins.members, comparisons.num_cases)
+    for part, some in margins.blocks(comparisons):
+        likelihood = comparisons.weighted(log_likelihood(some), part)
+        for asked in (0, 1):
+            chosen = half[part] == asked
+            case = comparisons.case[part][chosen]
+            belief[asked].index_add_(-1, case, likelihood[:, chosen])
+    favourite = belief.argmax(1)
+    met = []
+    for part, some in margins.blocks(comparisons):
+        judge = favourite[1 - half[part], comparisons.case[part]]
+        met.append(some.gather(0, judge.unsqueeze(0))[0] > 0)
+    return case_values(torch.cat(met).unsqueeze(0), comparisons)[0]
 
 
 def gain(margin: Tensor, pooled: Tensor | None, comparisons: Comparisons) -> Gain:

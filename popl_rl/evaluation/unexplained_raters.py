@@ -17,6 +17,7 @@ from torch import Tensor
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.evaluation.held_out_raters import met_answers
 from popl_rl.keys import ANSWER, PAIR, RATER
+from popl_rl.models.preference_likelihood import InParts
 from popl_rl.randomness import stream
 from popl_rl.raters.groups import RaterGroup
 from popl_rl.raters.pairs import PairPool
@@ -51,7 +52,7 @@ class Unexplained:
         return found | ({"unexplained_accuracy": self.accuracy} if self.share > 0 else {})
 
 
-def find_unexplained(margin: Tensor, comparisons: Comparisons) -> Unexplained:
+def find_unexplained(margin: Tensor | InParts, comparisons: Comparisons) -> Unexplained:
     """Count raters whose answers are met clearly less often than the median rater's.
 
     Each rater's answers are cut in two, as by ``popl_rl.evaluation.held_out_raters.gain``. A rater
@@ -104,4 +105,9 @@ def look_for_unexplained(
     answer = people.answer(pair, rater, segment_utility, generator=generator)
     said = TensorDict({PAIR: pair, ANSWER: answer, RATER: rater}, [len(rater)])
     asked = Comparisons.from_preferences(said, cases="rater")
-    return find_unexplained(scores[:, asked.preferred] - scores[:, asked.other], asked)
+
+    def margins(part: slice) -> Tensor:
+        return scores[:, asked.preferred[part]] - scores[:, asked.other[part]]
+
+    # Of a thousand samples of a posterior all at once would be 160 MB, several times.
+    return find_unexplained(InParts(len(scores), margins), asked)

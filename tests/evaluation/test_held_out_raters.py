@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from popl_rl.data.comparisons import Comparisons
-from popl_rl.evaluation.held_out_raters import draw_held_out_raters, favourites, gain
+from popl_rl.evaluation.held_out_raters import draw_held_out_raters, favourites, gain, met_answers
+from popl_rl.models.preference_likelihood import InParts
 
 
 def panel_of(raters, answers):
@@ -73,3 +74,20 @@ def test_members_that_differ_in_what_nobody_cares_about_gain_nothing(generator):
     """Margins that have nothing to do with who answers."""
     found = gain(torch.randn(6, 4000, generator=generator), None, panel_of(100, 40))
     assert abs(found.catered - found.alone) < 3 * found.error + 0.03
+
+
+def test_answers_are_met_by_the_favourite_of_the_other_half_in_any_number_of_parts(generator):
+    """So many members that 19 answers are looked at together, not all 22."""
+    panel = panel_of(2, 11)
+    margin = torch.randn(220_000, 22, generator=generator)
+    half = torch.arange(22) % 2
+    met = torch.zeros(22, dtype=torch.bool)
+    for asked in (0, 1):
+        chosen_by, judged = (half == asked).nonzero()[:, 0], (half != asked).nonzero()[:, 0]
+        favourite = favourites(margin[:, chosen_by], panel.rows(chosen_by))
+        met[judged] = margin[favourite[panel.case[judged]], judged] > 0
+    parts = InParts(len(margin), lambda part: margin[:, part])
+    assert len(list(parts.blocks(panel))) == 2
+    expected = met.view(2, 11).float().mean(1)
+    assert torch.equal(met_answers(parts, panel), expected)
+    assert torch.equal(met_answers(margin, panel), expected)
