@@ -15,7 +15,7 @@ from popl_rl import registry
 from popl_rl.data.behaviours import random_behaviour
 from popl_rl.data.rollouts import lockstep
 from popl_rl.data.segments import collect_segments
-from popl_rl.envs.hidden_utility import HiddenUtility, hidden_utility, sample_states
+from popl_rl.envs.hidden_utility import HiddenUtility, blend, hidden_utility, sample_states
 from popl_rl.raters.groups import make_groups
 from popl_rl.raters.people import Raters
 from popl_rl.testing import check_env as check_ours
@@ -316,3 +316,27 @@ def test_places_on_a_ring_and_blends_by_hand():
 def test_groups_of_one_function_have_names_of_their_own():
     groups = make_groups(["ring(0, 2)", "ring(1,2)"], label="return")
     assert [group.name for group in groups] == ["ring(0,2)", "ring(1,2)"]
+
+
+def test_how_right_nobody_can_be_after_eight_answers(generator):
+    """Who knows that all want a weighted mean, by any weight alike, is right in 0.956 of new pairs.
+
+    Bayes' rule over 101 weights, and the mean of the weights that eight answers leave.
+    """
+    raters, weights = 1000, torch.linspace(0, 1, 101)
+
+    def firsts(count):
+        """Of pairs drawn for each rater: difference of the pair, in every weight's eyes."""
+        states = sample_states(2 * count * raters, dimensions=2, generator=generator)
+        ends = torch.stack([blend(states, weight) for weight in (0.0, 1.0)])
+        apart = (ends[:, ::2] - ends[:, 1::2]).view(2, raters, count)
+        return apart[0].unsqueeze(-1) + (apart[1] - apart[0]).unsqueeze(-1) * weights
+
+    own = torch.randint(len(weights), (raters, 1, 1), generator=generator)
+    asked, new = firsts(8), firsts(200)
+    answered = asked.gather(2, own.expand(-1, 8, -1)) > 0
+    left = ((asked > 0) == answered).all(1).float()
+    believed = (left * weights).sum(1) / left.sum(1)
+    guess = new[..., 0] + (new[..., -1] - new[..., 0]) * believed.unsqueeze(1)
+    right = (guess > 0) == (new.gather(2, own.expand(-1, 200, -1)).squeeze(2) > 0)
+    assert float(right.float().mean()) == pytest.approx(0.956, abs=0.004)
