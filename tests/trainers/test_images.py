@@ -55,30 +55,37 @@ class Rows(torch.nn.Module):
 """
 
 
-@pytest.mark.slow  # a whole run, of several seconds
-def test_members_with_convolutions_serve_both_groups(config_of, tiny, tmp_path):
+@pytest.fixture
+def walk(tiny, tmp_path):
+    """Overrides for a run on pictures of a walk, in which two groups want opposite ends."""
     file = tmp_path / "walk.py"
     file.write_text(WALK)
-    config = config_of(
+    return [
         *tiny[1:],
         "env=custom",
         f"env.factory={file}:Walk",
         f"raters.groups=['{file}:left','{file}:right']",
         "raters.label=return",
         "env.success=",
-        "method.channels=[4]",
         "method.hidden=[16]",
         "method.training.steps=200",
         "method.training.learning_rate=0.005",
         "method.refinement.steps=200",
         "raters.answers=30",
         f"run_dir={tmp_path / 'run'}",
-    )
-    result = run(config)
-    board = result.board
+    ]
+
+
+def assert_serves_both(board):
+    """Either group gets most of what there is beyond random actions."""
     for group in ("left", "right"):
         got, floor = (board.value(method, group, "return") for method in ("popl", "random"))
         assert got > floor + 40  # of some 60
+
+
+@pytest.mark.slow  # a whole run, of several seconds
+def test_members_with_convolutions_serve_both_groups(config_of, walk, tmp_path):
+    assert_serves_both(run(config_of(*walk, "method.channels=[4]")).board)
     policies = PolicySet.load(tmp_path / "run" / "policies")
     assert policies.population.spec.image == (8, 8, 3)
     assert policies.population.spec.channels == (4,)
@@ -87,29 +94,9 @@ def test_members_with_convolutions_serve_both_groups(config_of, tiny, tmp_path):
 
 
 @pytest.mark.slow  # a whole run, of several seconds
-def test_members_act_on_features_and_serve_both_groups(config_of, tiny, tmp_path):
+def test_members_act_on_features_and_serve_both_groups(config_of, walk, tmp_path):
     (tmp_path / "eyes.py").write_text(EXTRACT)
-    file = tmp_path / "walk.py"
-    file.write_text(WALK)
-    config = config_of(
-        *tiny[1:],
-        "env=custom",
-        f"env.factory={file}:Walk",
-        f"env.features={tmp_path / 'eyes.py'}:Rows",
-        f"raters.groups=['{file}:left','{file}:right']",
-        "raters.label=return",
-        "env.success=",
-        "method.hidden=[16]",
-        "method.training.steps=200",
-        "method.training.learning_rate=0.005",
-        "method.refinement.steps=200",
-        "raters.answers=30",
-        f"run_dir={tmp_path / 'run'}",
-    )
-    board = run(config).board
-    for group in ("left", "right"):
-        got, floor = (board.value(method, group, "return") for method in ("popl", "random"))
-        assert got > floor + 40  # of some 60
+    assert_serves_both(run(config_of(*walk, f"env.features={tmp_path / 'eyes.py'}:Rows")).board)
     seen = load_tensordict(tmp_path / "run" / "data" / "segments")["observation"]
     assert seen.shape[2:] == (6,)  # segments hold features alone
     policies = PolicySet.load(tmp_path / "run" / "policies")

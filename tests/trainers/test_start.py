@@ -75,17 +75,7 @@ CASES = {
 }
 
 
-COMMANDS = [
-    (script, *case)
-    for script, cases in (
-        ("train_popl", TRAIN),
-        ("evaluate_policies", EVALUATE),
-        ("run_benchmark", BENCHMARK),
-        ("label_pairs", LABEL),
-        ("serve_policies", SERVE),
-    )
-    for case in cases
-]
+COMMANDS = [(script, *case) for script, cases in CASES.items() for case in cases]
 
 
 @pytest.fixture(scope="module")

@@ -208,19 +208,18 @@ def test_mixtures_without_rater_ids(train, capsys):
 
 
 @pytest.mark.parametrize(
-    ("method", "label", "found", "draws"),
+    ("method", "label", "found"),
     [
-        ("cpl", "cpl", PolicySet, True),
-        ("multi_cpl", "multi_cpl", PolicySet, False),
-        ("em", "em", PolicySet, False),
-        ("vpl", "vpl", EncodedPolicySet, True),
-        ("popl_tournament", "popl_tournament", PolicySet, False),
-        ("popl_nsga2", "popl_nsga2", PolicySet, True),
+        ("cpl", "cpl", PolicySet),
+        ("multi_cpl", "multi_cpl", PolicySet),
+        ("em", "em", PolicySet),
+        ("vpl", "vpl", EncodedPolicySet),
+        ("popl_tournament", "popl_tournament", PolicySet),
+        ("popl_nsga2", "popl_nsga2", PolicySet),
     ],
 )
-def test_methods_to_compare_with(train, method, label, found, draws):
-    figures = f"evaluation.figures={str(draws).lower()}"
-    result = train(f"method={method}", "evaluation.episodes=4", figures)
+def test_methods_to_compare_with(train, method, label, found):
+    result = train(f"method={method}", "evaluation.episodes=4", "evaluation.figures=true")
     assert type(result.policies) is found
     results = result.board.results
     assert set(results.method) == {label, "pooled_cpl", "oracle", "random", *IN_ANY_CASE}
@@ -231,12 +230,9 @@ def test_methods_to_compare_with(train, method, label, found, draws):
     assert set(pd.read_csv(result.run_dir / "history.csv").generation) == {1, 3}
     report = (result.run_dir / "report.md").read_text()
     assert report.startswith("# POPL: ") == (label == "popl")
-    if draws:
-        pictures = {path.stem for path in (result.run_dir / "figures").iterdir()}
-        assert {"learning", "members", "occupancy"} <= pictures
-        assert ("selection" in pictures) == method.startswith("popl")
-    else:
-        assert not (result.run_dir / "figures").exists()
+    pictures = {path.stem for path in (result.run_dir / "figures").iterdir()}
+    assert {"learning", "members", "occupancy"} <= pictures
+    assert ("selection" in pictures) == method.startswith("popl")
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
