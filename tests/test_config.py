@@ -285,7 +285,7 @@ def test_epsilon_refuses(epsilon):
 
 CHOICES = sorted(
     f"{group}={path.relative_to(FOLDER / group).with_suffix('').as_posix()}"
-    for group in ("env", "raters", "method", "logger")
+    for group in ("env", "raters", "method", "recipe", "logger")
     for path in (FOLDER / group).rglob("*.yaml")
 )
 
@@ -350,3 +350,26 @@ def test_a_method_outranks_an_environment(config_of):
 def test_raters_say_how_many_they_are_whatever_their_environment(config_of, raters, count, answers):
     config = config_of("env=hidden_utility", f"raters={raters}")
     assert (config.raters.count, config.raters.answers) == (count, answers)
+
+
+@pytest.mark.parametrize(
+    ("env", "own"),
+    [
+        ("metaworld/any", {"hidden": [128, 128]}),
+        ("hopper", {"beta": 0.0001}),
+        ("half_cheetah", {"beta": 0.0001}),
+        ("dynamic_obstacles", {"beta": 0.0001}),
+    ],
+)
+def test_a_recipe_is_that_of_the_environments_it_was_tuned_on(config_of, env, own):
+    """Members of one's own environment are style codes by one word."""
+    shared = config_of("env=gym", "recipe=style_codes").method
+    assert (shared.evolve, shared.training.steps, shared.training.conservatism) == ("code", 96, 1)
+    shared.hidden = own.get("hidden", shared.hidden)
+    shared.clone.beta = own.get("beta", shared.clone.beta)
+    assert config_of(f"env={env}").method == shared
+
+
+def test_a_method_outranks_a_recipe(config_of):
+    config = config_of("recipe=style_codes", "method=popl_published")
+    assert (config.method.evolve, config.method.generations) == ("head", 100)

@@ -1,0 +1,1 @@
+"""Recipes of methods that several environments share."""
