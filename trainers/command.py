@@ -93,7 +93,6 @@ def _run(main: Callable[[], Any], schema: type) -> None:
         sys.argv[1:] = as_typed(sys.argv[1:], schema)
         with listening():
             main()
-        _forget_sweep()
     except (KeyboardInterrupt, Terminated) as stop:
         word, code = ("terminated", 143) if isinstance(stop, Terminated) else ("interrupted", 130)
         cure = next(iter(getattr(stop, "__notes__", [])), "the same command begins anew")
@@ -103,6 +102,7 @@ def _run(main: Callable[[], Any], schema: type) -> None:
         _print_error(f"error: {explained(error, schema)}")
         sys.exit(2)
     finally:
+        _forget_sweep()
         del os.environ["HYDRA_FULL_ERROR"]
 
 

@@ -21,7 +21,7 @@ from omegaconf import MISSING
 from rich.console import Console
 
 from popl_rl.evaluation.suite import Suite
-from popl_rl.experiments.cells import Cell, claim, collect, is_finished, plan
+from popl_rl.experiments.cells import Cell, check_folder, claim, collect, is_finished, plan
 from popl_rl.experiments.jobs import Job, run_jobs
 from popl_rl.experiments.suites import load_suite
 from popl_rl.interruption import Terminated, importing
@@ -61,9 +61,10 @@ def run(config: BenchmarkConfig) -> Result:
     # 1. What there is to do.
     suite, cells, run_dir = _begun(config)
     wanted = cells if config.cell is None else _one(cells, config.cell)
-    claim(run_dir, suite, cells)
+    check_folder(run_dir, suite)  # a wrong folder is told before wrong settings
     unfinished = [cell for cell in wanted if not is_finished(cell, run_dir)]
     tasks = make_tasks(unfinished, run_dir)
+    claim(run_dir, suite, cells)  # after the settings: wrong ones leave no folder behind
     # Imported late, so that a wrong setting is told at once.
     with importing():
         from popl_rl.experiments.benchmark_report import write_report

@@ -22,7 +22,7 @@ from popl_rl.keys import OBSERVATION
 from popl_rl.plug_ins import call, defined
 from popl_rl.registry import resolve
 
-__all__ = ["Extracted", "extractor", "feature_source", "with_features"]
+__all__ = ["Extracted", "extractor", "feature_source", "frozen", "with_features"]
 
 _BLOCK = 1024  # observations that are read at once
 
@@ -45,14 +45,32 @@ def extractor(reference: str) -> Extractor:
         ValueError: If the reference cannot be resolved, or making the module fails.
         TypeError: If it makes something other than a module.
     """
-    found = resolve("features", reference)
+    return frozen(reference, resolve("features", reference))
+
+
+def frozen(name: str, found: Any) -> Extractor:
+    """An extractor of which nothing is trained: what is shown ``[B, ...]`` -> ``[B, F]`` float32.
+
+    Args:
+        name: What messages call it.
+        found: What a reference names, see ``extractor``.
+
+    Raises:
+        ValueError: If making the module fails.
+        TypeError: If it can make or read nothing.
+    """
+    if not callable(found):
+        raise TypeError(
+            f"features {name!r} must be a torch.nn.Module, what makes one, or a function of what "
+            f"is shown, got {type(found).__name__}"
+        )
     if not isinstance(found, nn.Module) and _makes_one(found):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)  # untrained weights are the same wherever they are made
-            made = call("features", reference, "making it", found)
+            made = call("features", name, "making it", found)
         if not isinstance(made, nn.Module):
             raise TypeError(
-                f"features {reference!r}: what takes no argument must return a torch.nn.Module, "
+                f"features {name!r}: what takes no argument must return a torch.nn.Module, "
                 f"got {type(made).__name__} ({defined(found)})"
             )
         found = made
@@ -61,12 +79,12 @@ def extractor(reference: str) -> Extractor:
 
     @torch.no_grad()
     def extract(shown: Tensor) -> Tensor:
-        given = call("features", reference, "reading observations", found, shown)
+        given = call("features", name, "reading observations", found, shown)
         is_fitting = isinstance(given, Tensor) and given.ndim > 1 and len(given) == len(shown)
         if not is_fitting or given.is_complex():
             got = list(given.shape) if isinstance(given, Tensor) else type(given).__name__
             raise TypeError(
-                f"features {reference!r} must return numbers of shape [{len(shown)}, F] for "
+                f"features {name!r} must return numbers of shape [{len(shown)}, F] for "
                 f"observations of shape {list(shown.shape)}, got {got} ({defined(found)})"
             )
         return cast("Tensor", given).flatten(1).float().cpu()

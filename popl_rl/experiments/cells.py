@@ -22,7 +22,16 @@ from popl_rl.storage import write_atomic, write_json
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["COLUMNS", "Cell", "claim", "collect", "is_finished", "plan", "results_digest"]
+__all__ = [
+    "COLUMNS",
+    "Cell",
+    "check_folder",
+    "claim",
+    "collect",
+    "is_finished",
+    "plan",
+    "results_digest",
+]
 
 COLUMNS = ["suite", "scenario", "seed", "method", "choice", "group", "measure", "value"]
 """Columns of a benchmark's ``results.csv``."""
@@ -109,18 +118,12 @@ def plan(suite: Suite, *, seeds: int) -> list[Cell]:
     return cells
 
 
-def claim(run_dir: Path, suite: Suite, cells: Sequence[Cell]) -> None:
-    """Take a folder for a suite, or go on in one: writes ``benchmark.json`` and ``cells.csv``.
-
-    Args:
-        run_dir: Folder of the benchmark.
-        suite: The suite.
-        cells: All of its cells; ``cells.csv`` tells their numbers.
+def check_folder(run_dir: Path, suite: Suite) -> None:
+    """Refuse a folder that a suite can neither take nor go on in; nothing is written.
 
     Raises:
-        ValueError: If the folder is that of another suite, or holds something else.
+        ValueError: If it is that of another suite, or holds something else.
     """
-    run_dir.mkdir(parents=True, exist_ok=True)
     kept = run_dir / "benchmark.json"
     if kept.is_file():
         cure = f"remove it if {run_dir} is of suite {suite.name!r}, or choose another run_dir"
@@ -132,10 +135,25 @@ def claim(run_dir: Path, suite: Suite, cells: Sequence[Cell]) -> None:
                 "run_dir"
             )
     # Hidden files are those that another process is just writing.
-    elif any(not path.name.startswith(".") for path in run_dir.iterdir()):
+    elif run_dir.exists() and any(path.name[0] != "." for path in run_dir.iterdir()):
         raise ValueError(f"run_dir {run_dir} holds something else; choose another run_dir")
-    else:
-        write_json(kept, {"suite": suite.name})
+
+
+def claim(run_dir: Path, suite: Suite, cells: Sequence[Cell]) -> None:
+    """Take a folder for a suite, or go on in one: writes ``benchmark.json`` and ``cells.csv``.
+
+    Args:
+        run_dir: Folder of the benchmark.
+        suite: The suite.
+        cells: All of its cells; ``cells.csv`` tells their numbers.
+
+    Raises:
+        ValueError: If the folder is that of another suite, or holds something else.
+    """
+    check_folder(run_dir, suite)
+    run_dir.mkdir(parents=True, exist_ok=True)
+    if not (run_dir / "benchmark.json").is_file():
+        write_json(run_dir / "benchmark.json", {"suite": suite.name})
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
     writer.writerow(["cell", "scenario", "method", "seed"])

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from popl_rl.testing.environments import check_env
+from popl_rl.testing.feature_extractors import check_features
 from popl_rl.testing.methods import check_method
 from popl_rl.testing.rater_functions import check_rater
 from popl_rl.testing.readers import check_reader
@@ -21,6 +22,7 @@ __all__ = ["main"]
 _RECEIVERS = {
     "env": "the environment, as in doors=3",
     "rater": "the environment, as in doors=3",
+    "features": "the environment, as in view=partial",
     "selection": "the rule, as in size=2",
     "method": "the method, as method.options are",
     "reader": "the environment, as in doors=3",
@@ -52,6 +54,8 @@ def _check(given: argparse.Namespace, arguments: dict[str, Any]) -> None:
         check_env(given.reference, **arguments)
     elif given.kind == "rater":
         check_rater(given.reference, given.env, **arguments)
+    elif given.kind == "features":
+        check_features(given.reference, given.env, **arguments)
     elif given.kind == "selection":
         check_selection(given.reference, **arguments)
     elif given.kind == "method":
@@ -82,6 +86,9 @@ def _parser() -> argparse.ArgumentParser:
             help=f"arguments of {receiver}",
         )
     rater, method, reader = (kinds.choices[kind] for kind in ("rater", "method", "reader"))
+    kinds.choices["features"].add_argument(
+        "--env", required=True, help="environment whose observations are read"
+    )
     rater.add_argument("--env", help="environment whose segments are judged")
     method.add_argument("--cases", default="rater", choices=("rater", "preference"))
     method.add_argument("--evolve", default="all", choices=("all", "head"))

@@ -36,14 +36,23 @@ def name_of(thing: Any) -> str:
 
 
 @contextmanager
-def made_env(name: str, env: EnvReference, arguments: dict[str, Any]) -> Iterator[Env]:
-    """Yield the environment, and close it if it was made here."""
+def made_env(
+    name: str, env: EnvReference, arguments: dict[str, Any], *, flat: bool = True
+) -> Iterator[Env]:
+    """Yield the environment, and close it if it was made here.
+
+    Args:
+        name: What messages call it.
+        env: The environment, its factory, or a reference to the factory.
+        arguments: Keyword arguments of the factory.
+        flat: Whether with the spaces that training sees, and not its own.
+    """
     if isinstance(env, gymnasium.Env):
         if arguments:
             raise TypeError(
                 f"env {name!r} is made already and takes no arguments, got {arguments}."
             )
-        yield _flat(name, env)
+        yield _flat(name, env) if flat else env
         return
     factory = registry.resolve("env", env) if isinstance(env, str) else env
     if not callable(factory):
@@ -58,7 +67,7 @@ def made_env(name: str, env: EnvReference, arguments: dict[str, Any]) -> Iterato
             "gymnasium.Env, or wrap what you have."
         )
     try:
-        yield _flat(name, made)
+        yield _flat(name, made) if flat else made
     finally:
         made.close()
 

@@ -24,7 +24,9 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     assert "Did you mean 'two_doors'?" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("arguments", [[], ["env"], ["env", "two_doors", "--with", "doors"]])
+@pytest.mark.parametrize(
+    "arguments", [[], ["env"], ["env", "two_doors", "--with", "doors"], ["features", "a:b"]]
+)
 def test_command_line_misuse(arguments, capsys):
     with pytest.raises(SystemExit) as caught:
         main(arguments)
@@ -47,6 +49,7 @@ def test_module_runs(monkeypatch, capsys):
     ("arguments", "said"),
     [
         (["selection", "tournament", "--with", "size=2"], "selection tournament"),
+        (["features", "torch.nn:Flatten", "--env", "lava_gap"], "features torch.nn:Flatten"),
         (["method", "popl_rl.algorithms.multi_cpl:MultiCPL", "--learns", "reward"], "method popl"),
     ],
 )
@@ -63,10 +66,12 @@ def test_faults_of_other_kinds_are_one_line(tmp_path, monkeypatch, capsys):
     (tmp_path / "mine.py").write_text(
         "def first(values, count, *, generator):\n    return [0] * count\n\n\n"
         "def read(path):\n    return path.read_text()\n\n\n"
+        "def blind(images):\n    raise RuntimeError('cannot\\nsee')\n\n\n"
         "class Lazy:\n    def __init__(self, problem, *, generator):\n        pass\n"
     )
     for arguments, fault in (
         (["selection", "mine.py:first"], "selection 'first' must return a tensor of int64"),
+        (["features", "mine.py:blind", "--env", "lava_gap"], "features 'blind': reading obs"),
         (["reader", "mine.py:read", "--data", "mine.py"], "reader 'read' must return (segments, "),
         (["reader", "mine.py:read", "--data", "other.py"], "there is nothing at other.py"),
         (["method", "mine.py:Lazy"], "method 'Lazy' must have a method step()"),

@@ -355,6 +355,7 @@ def test_interrupting(call, trainer):
         (["suite=two_dors"], ["unknown suite 'two_dors'", "Did you mean 'two_doors'", "smoke"]),
         (["suite=nowhere.yaml"], ["unknown suite 'nowhere.yaml'"]),
         (["seeds=0"], ["seeds must be at least 1, got 0"]),
+        (["seeds=0", "-m"], ["seeds must be at least 1, got 0"]),
         (["seeds=many"], ["many", "seeds"]),
         (["cell=4"], ["cell must be from 0 to 3, got 4", "cells.csv"]),
         (["cell=-1"], ["cell must be from 0 to 3, got -1"]),
@@ -379,6 +380,7 @@ def test_what_the_user_can_put_right(call, trainer, overrides, parts):
     for part in parts:
         assert part in text[text.index("error:") :]
     assert trainer.cells == []
+    assert {path.suffix for path in Path().iterdir()} == {".yaml"}, "no folder is left behind"
 
 
 def test_a_suite_must_be_named(call):
