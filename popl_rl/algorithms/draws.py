@@ -1,6 +1,7 @@
 """Batches of comparisons: how often each member draws each."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -9,15 +10,30 @@ from popl_rl.data.comparisons import Comparisons
 
 __all__ = ["Draws", "by_case", "by_comparison", "uniform"]
 
-#: Maps a batch size B and a generator to comparisons drawn with replacement, ``[N, B]``.
-Draws = Callable[[int, torch.Generator], Tensor]
-
 # Up to so many comparisons ``torch.multinomial`` draws. It adds up all weights of all members at
 # every step, in float32, in which small weights are lost among millions, and takes 2^24 at most.
 _FEW = 2**17
 
 # A member that is strong nowhere, or serves nobody, still needs something: everything, a bit.
 _LEAST = 1e-6
+
+
+@dataclass(frozen=True)
+class Draws:
+    """How often each member draws each comparison.
+
+    Attributes:
+        draw: Maps a batch size B and a generator to comparisons drawn with replacement, ``[N, B]``.
+        answers: Answers that each member learns from, ``[N]``: the sum of its weights, in which a
+            comparison that is fully its own counts 1.
+    """
+
+    draw: Callable[[int, torch.Generator], Tensor]
+    answers: Tensor
+
+    def __call__(self, batch_size: int, generator: torch.Generator) -> Tensor:
+        """Comparisons of a batch for each member, ``[N, B]``."""
+        return self.draw(batch_size, generator)
 
 
 def uniform(comparisons: Comparisons, count: int) -> Draws:
@@ -36,7 +52,7 @@ def uniform(comparisons: Comparisons, count: int) -> Draws:
     def draw(batch_size: int, generator: torch.Generator) -> Tensor:
         return torch.randint(number, (count, batch_size), generator=generator, device=device)
 
-    return draw
+    return Draws(draw, torch.full((count,), float(number), device=device))
 
 
 def by_comparison(comparisons: Comparisons, weight: Tensor, *, least: float = _LEAST) -> Draws:
@@ -48,12 +64,16 @@ def by_comparison(comparisons: Comparisons, weight: Tensor, *, least: float = _L
         least: What is added to every weight; if 0, each row needs a positive one.
     """
     weight = comparisons.weighted(weight + least)
+    answers = weight.sum(1)
     if len(comparisons) <= _FEW:
-        return lambda batch_size, generator: torch.multinomial(
-            weight, batch_size, replacement=True, generator=generator
+        return Draws(
+            lambda batch_size, generator: torch.multinomial(
+                weight, batch_size, replacement=True, generator=generator
+            ),
+            answers,
         )
     total = weight.cumsum(1, dtype=torch.float64)
-    return lambda batch_size, generator: _draw(total, batch_size, generator)
+    return Draws(lambda batch_size, generator: _draw(total, batch_size, generator), answers)
 
 
 def by_case(comparisons: Comparisons, weight: Tensor, *, least: float = _LEAST) -> Draws:
@@ -84,7 +104,7 @@ def by_case(comparisons: Comparisons, weight: Tensor, *, least: float = _LEAST) 
         # Rounding must not lead to the next case.
         return grouped.order[place.minimum(grouped.last[case])]
 
-    return draw
+    return Draws(draw, total[:, -1])
 
 
 def _draw(total: Tensor, batch_size: int, generator: torch.Generator) -> Tensor:

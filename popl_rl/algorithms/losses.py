@@ -20,7 +20,7 @@ def cpl_loss(
     *,
     conservatism: float = 1.0,
     slip: float = 0.0,
-    cloning: float = 0.0,
+    cloning: float | Tensor = 0.0,
 ) -> Tensor:
     """CPL loss of scored pairs, ``-log sigmoid(S(sigma+) - lambda S(sigma-))``.
 
@@ -34,13 +34,18 @@ def cpl_loss(
         conservatism: Lambda in (0, 1].
         slip: Chance that an answer is a slip, in [0, 0.5), see
             ``popl_rl.models.preference_likelihood.log_likelihood``.
-        cloning: Weight of behaviour cloning, of minus the mean score of both segments.
+        cloning: Weight of behaviour cloning, of minus the mean score of both segments; one number,
+            or one for each member that goes with the scores' shape.
 
     Returns:
         Losses, same shape.
     """
     loss = -log_likelihood(preferred - conservatism * other, slip)
-    return loss - cloning * (preferred + other) / 2 if cloning else loss
+    return loss if _is_none(cloning) else loss - cloning * (preferred + other) / 2
+
+
+def _is_none(cloning: float | Tensor) -> bool:
+    return not isinstance(cloning, Tensor) and cloning == 0
 
 
 def answer_losses(
@@ -51,7 +56,7 @@ def answer_losses(
     *,
     conservatism: float = 1.0,
     slip: float = 0.0,
-    cloning: float = 0.0,
+    cloning: float | Tensor = 0.0,
 ) -> Tensor:
     """CPL losses of drawn answers, as ``cpl_loss``; ties and stages count as what they say.
 
@@ -62,21 +67,44 @@ def answer_losses(
         index: Those drawn, ``[..., B]`` or ``[B]``.
         conservatism: Lambda in (0, 1].
         slip: Chance that an answer is a slip, in [0, 0.5).
-        cloning: Weight of behaviour cloning, of minus the mean score of an answer's segments.
+        cloning: Weight of behaviour cloning, of minus the mean score of an answer's segments, as
+            ``cpl_loss`` takes it.
 
     Returns:
         ``[..., B]``, see ``popl_rl.models.preference_likelihood.answer_likelihood``.
     """
     loss = -drawn_likelihood(preferred - conservatism * other, comparisons, index, slip)
-    if not cloning:
+    if _is_none(cloning):
         return loss
     score: Tensor = (preferred + other).unflatten(-1, (index.shape[-1], -1)).mean(-1)
     return loss - cloning * score / 2
 
 
-def cloning_weight(bc: float, *, alpha: float, bank: SegmentBank) -> float:
-    """``bc`` as a weight of scores, which are ``alpha`` times the sum over a segment's steps."""
-    return bc / (alpha * bank.row.shape[1])
+def cloning_weight(
+    bc: float, answers: float | Tensor, *, alpha: float, bank: SegmentBank
+) -> float | Tensor:
+    """Behaviour cloning that weighs ``bc`` answers, as a weight of scores beside one answer's loss.
+
+    The loss is a mean over answers, so that what weighs as much as ``bc`` of them has a share of
+    ``bc / answers``: the more somebody has said, the less the data's own behaviour matters. It is
+    the prior of a maximum a posteriori estimate.
+
+    Args:
+        bc: How many answers behaviour cloning weighs.
+        answers: How many answers are learnt from; a number, or one for each member, ``[N]``.
+        alpha: Temperature: scores are ``alpha`` times the sum over a segment's steps.
+        bank: The segments.
+
+    Returns:
+        0 without cloning, a number, or ``[N, 1]``.
+    """
+    if bc == 0:
+        return 0.0
+    weight = bc / (alpha * bank.row.shape[1])
+    if not isinstance(answers, Tensor):
+        return weight / answers
+    # A member that serves nobody is a clone of the data, but not by an endless force.
+    return weight / answers.clamp(min=1).float().unsqueeze(1)
 
 
 class CPLLoss(LossModule):
@@ -93,8 +121,12 @@ class CPLLoss(LossModule):
         conservatism: Lambda in (0, 1].
         discount: Per-step discount gamma.
         slip: Chance that an answer is a slip.
-        bc: Weight of behaviour cloning, of minus the mean log-likelihood of a step of both
-            segments of a pair (of segments without padding and discount).
+        bc: How many answers behaviour cloning weighs, minus the mean log-likelihood of a step of
+            both segments of a pair (of segments without padding and discount): its share in the
+            loss is ``bc / num_answers``.
+
+    Attributes:
+        num_answers: How many answers the members learn from, 1 or ``[N]``; ``descend`` sets it.
 
     Raises:
         ValueError: If ``alpha`` is not positive, ``bc`` is negative, or ``conservatism`` or
@@ -137,6 +169,7 @@ class CPLLoss(LossModule):
         self.discount = discount
         self.slip = slip
         self.bc = bc
+        self.num_answers: float | Tensor = 1.0
         self._features: Tensor | None = None
         self._cells = bank.row
 
@@ -188,9 +221,9 @@ class CPLLoss(LossModule):
         return spec.step_scores(output, bank.action[segment].flatten(-3, -2))
 
     @property
-    def cloning(self) -> float:
+    def cloning(self) -> float | Tensor:
         """The weight of behaviour cloning that ``cpl_loss`` takes."""
-        return cloning_weight(self.bc, alpha=self.alpha, bank=self.bank)
+        return cloning_weight(self.bc, self.num_answers, alpha=self.alpha, bank=self.bank)
 
     def losses(self, preferred: Tensor, other: Tensor) -> Tensor:
         """Losses of scored pairs, any shape."""
@@ -281,6 +314,7 @@ def descend(
     """
     count = len(loss.population)
     draws = uniform(comparisons, count) if draws is None else draws
+    loss.num_answers = draws.answers
     value = torch.tensor(float("nan"))
     for _ in range(steps):
         index = draws(batch_size, generator)

@@ -108,7 +108,7 @@ class NicheSearch:
         parents = [kept[parent] for parent in self._select(values, place)]
         children = self.stack.subset(parents)
         personalise(
-            self.problem.loss(children),
+            self.problem.loss(children, cloning=False),
             self.problem.comparisons,
             self.raters[place],
             steps=self.popl.specialist_steps,

@@ -81,8 +81,13 @@ class Problem:
             return StyledPopulation(self.clone, self.clone.typical().expand(count, -1))
         return Population.create(self.spec, count, generator=generator).to(self.device)
 
-    def loss(self, population: Population) -> CPLLoss:
-        """The CPL loss of a population under the recipe."""
+    def loss(self, population: Population, *, cloning: bool = True) -> CPLLoss:
+        """The CPL loss of a population under the recipe.
+
+        Args:
+            population: N members.
+            cloning: Whether the recipe's behaviour cloning is part of it.
+        """
         return CPLLoss(
             population,
             self.bank,
@@ -90,7 +95,7 @@ class Problem:
             conservatism=self.conservatism,
             discount=self.training.discount,
             slip=self.training.slip,
-            bc=self.spec.cloning(self.training.bc),
+            bc=self.spec.cloning(self.training.bc) if cloning else 0.0,
         )
 
     def scores(self, population: Population) -> Tensor:

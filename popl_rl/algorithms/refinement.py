@@ -107,6 +107,7 @@ class _CrossFitting:
         order = torch.randperm(comparisons.num_cases, generator=generator, device=device)
         self.fold = order % settings.folds
         self.case = torch.arange(comparisons.num_cases, device=device)
+        self.size = comparisons.sizes().float()
         self.copy = torch.arange(settings.folds + 1, device=device)
         likelihood = self._likelihood(population)
         chosen = smallest_subset(likelihood, comparisons, most=settings.most)
@@ -152,6 +153,7 @@ class _CrossFitting:
         )
         self.served = expect(likelihood, self.share).responsibility[self.fold, :, self.case].T
         self.share = self.served.mean(1)
+        self.loss.num_answers = self._weight(self.case) @ self.size
 
     def _weight(self, case: Tensor) -> Tensor:
         """How much comparisons of cases ``[B]`` count for each copy of a member, ``[N, B]``."""

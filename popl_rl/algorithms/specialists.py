@@ -64,7 +64,6 @@ def specialists(
         conservatism=loss.conservatism,
         discount=loss.discount,
         slip=loss.slip,
-        bc=loss.bc,
     )
     personalise(
         own,
@@ -90,8 +89,11 @@ def personalise(
 ) -> None:
     """Train each member for a moment on the answers of one rater.
 
+    There is no cloning: a few steps keep near where a member starts, while a prior that weighs as
+    much as one rater's answers would hide what the rater wants.
+
     Args:
-        loss: The loss to descend, whose S members are changed in place.
+        loss: The loss to descend, whose S members are changed in place; without cloning.
         comparisons: M strict preferences of C raters.
         raters: The rater of each member, by their cases, ``[S]``.
         steps: Gradient steps.

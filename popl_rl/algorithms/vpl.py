@@ -199,7 +199,10 @@ class VPL:
             conservatism=self.problem.conservatism,
             slip=recipe.slip,
             cloning=cloning_weight(
-                self.spec.cloning(recipe.bc), alpha=recipe.alpha, bank=self.problem.bank
+                self.spec.cloning(recipe.bc),
+                len(said),
+                alpha=recipe.alpha,
+                bank=self.problem.bank,
             ),
         ).mean()
         mirrored = torch.zeros_like(loss)

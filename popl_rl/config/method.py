@@ -27,7 +27,7 @@ class Training:
 
     alpha: float = 0.25  # scale of the scores (CPL's temperature); smaller makes sharper policies
     conservatism: float = 0.8  # lambda of the CPL loss, in (0, 1]; 1 for reward functions
-    bc: float = 0.0  # weight of behaviour cloning of both segments, for policies
+    bc: float = 0.0  # answers that behaviour cloning weighs, for policies; 0 for none
     slip: float = 0.05  # chance of a slip that the likelihood of an answer reckons with
     discount: float = 1.0  # per-step discount of the scores
     learning_rate: float = 2e-3  # of Adam; held for half of the generations, then falls to zero

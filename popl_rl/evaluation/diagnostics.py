@@ -132,7 +132,7 @@ def left_data(results: pd.DataFrame) -> str | None:
     each = ", ".join(f"{row.value:.0%} for {row.group}" for row in gone.itertuples())
     return (
         f"policies leave the data: as near to the data as 95% of held-out data are {each} of their "
-        "steps; if they fall or stand still, try method.training.bc=0.3 or 1, a lower "
+        "steps; if they fall or stand still, try method.training.bc=100 or 300, a lower "
         "method.training.conservatism, or style codes (method.evolve=code)"
     )
 

@@ -32,6 +32,7 @@ def test_comparisons_are_drawn_as_their_weights_say(generator, own, of):
     else:
         draws, spread = uniform(comparisons, 2), torch.ones(2, 9)
     chance = comparisons.weighted(spread)
+    torch.testing.assert_close(draws.answers.float(), chance.sum(1))
     chance = chance / chance.sum(1, keepdim=True)
     drawn = draws(40_000, generator)
     assert drawn.shape == (2, 40_000)

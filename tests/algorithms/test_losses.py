@@ -8,7 +8,13 @@ from tensordict import TensorDict
 from torch import nn
 
 from popl_rl.algorithms.draws import by_comparison
-from popl_rl.algorithms.losses import CPLLoss, answer_losses, cpl_loss, descend
+from popl_rl.algorithms.losses import (
+    CPLLoss,
+    answer_losses,
+    cloning_weight,
+    cpl_loss,
+    descend,
+)
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.policies import PolicySpec
@@ -75,6 +81,33 @@ def test_cloning_by_hand(hand):
         batch = batch_of([[0]], [[1]])
         added = with_bc(batch)["loss_cpl"] - without(batch)["loss_cpl"]
         assert float(added.detach()) == pytest.approx(-3.0 * mean, rel=1e-5)
+        # Beside 12 answers, what weighs 3 of them has a share of a quarter.
+        with_bc.num_answers = torch.tensor([12.0])
+        added = with_bc(batch)["loss_cpl"] - without(batch)["loss_cpl"]
+        assert float(added.detach()) == pytest.approx(-mean / 4, rel=1e-5)
+
+
+def test_the_more_answers_the_less_cloning(hand):
+    """Members that learn from 8, from 2 and from no answers; the last counts as one."""
+    bank, answers = hand[1], torch.tensor([8.0, 2.0, 0.0])
+    found = cloning_weight(4.0, answers, alpha=0.5, bank=bank)
+    torch.testing.assert_close(found, torch.tensor([[0.5], [2.0], [4.0]]))
+    assert cloning_weight(4.0, 8, alpha=0.5, bank=bank) == 0.5
+    assert cloning_weight(0.0, answers, alpha=0.5, bank=bank) == 0.0
+
+
+def test_descent_tells_the_loss_how_many_answers_there_are(hand, generator):
+    """Of three answers the member learns from the first fully and from the last by half."""
+    loss = CPLLoss(*hand, bc=1.0)
+    rows = torch.tensor([0, 0, 0])
+    comparisons = Comparisons(rows, rows + 1, rows, 1)
+    optimizer = torch.optim.Adam(hand[0].members.parameters())
+    draws = by_comparison(comparisons, torch.tensor([[1.0, 0.0, 0.5]]), least=0.0)
+    how = {"steps": 1, "batch_size": 4, "generator": generator}
+    descend(loss, optimizer, comparisons, draws=draws, **how)
+    torch.testing.assert_close(loss.num_answers, torch.tensor([1.5]))
+    descend(loss, optimizer, comparisons, **how)
+    torch.testing.assert_close(loss.num_answers, torch.tensor([3.0]))
 
 
 def test_scores_by_hand(hand):

@@ -1,8 +1,10 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
+from popl_rl.algorithms.losses import CPLLoss
 from popl_rl.algorithms.needed import nested_subsets
 from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.refinement import refine, smallest_subset
@@ -121,3 +123,22 @@ def test_the_same_seed_gives_the_same_bits():
     another = refined(seed=4)[0].members.data
     assert (one == other).all()
     assert not (one == another).all()
+
+
+def test_cloning_weighs_what_is_asked_beside_what_a_member_serves(monkeypatch):
+    """A third of the answers is left out of each copy but the last."""
+    population, bank, comparisons = two_tastes()
+    known = []
+    losses = CPLLoss.answers
+
+    def watched(self, *arguments):
+        known.append(self.num_answers.clone())
+        return losses(self, *arguments)
+
+    monkeypatch.setattr(CPLLoss, "answers", watched)
+    problem = Problem(population.spec, bank, comparisons, replace(RECIPE, bc=2.0))
+    settings = RefinementSettings(steps=30, most=2, folds=3)
+    found = refine(problem, population, settings=settings, generator=torch.Generator())
+    served = known[-1].view(4, len(found)).sum(1)
+    assert served[:3].sum() == pytest.approx(2 * len(comparisons), rel=1e-4)
+    assert served[3] == pytest.approx(len(comparisons), rel=1e-4)
