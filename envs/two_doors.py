@@ -6,6 +6,7 @@ transitions are listed in a table, which gives exact advantages, behaviours and 
 
 import itertools
 from collections.abc import Callable
+from functools import cache
 from typing import Any, Literal, TypeAlias
 
 import gymnasium
@@ -107,6 +108,7 @@ class TwoDoors(MiniGridEnv):
         self.states = [(x, y, direction) for x, y in free for direction in range(4)]
         self.cells = torch.tensor([state[:2] for state in self.states])
         self._index = {state: index for index, state in enumerate(self.states)}
+        self._laid_out: Grid | None = None
         near = [s for s in self.states if s[:2] in self.near_cells]
         anywhere = [s for s in self.states if s[:2] != self.goal_cell]
         # Entries may repeat: a start is a uniform draw from this list.
@@ -173,15 +175,8 @@ class TwoDoors(MiniGridEnv):
         """Return every transition of this environment, exactly."""
         num_states = len(self.states)
         shape = (num_states, 3)
-        next_state = torch.empty(shape, dtype=torch.int64)
-        door = torch.empty(shape, dtype=torch.int64)
-        goal = torch.empty(shape, dtype=torch.bool)
-        for index, state in enumerate(self.states):
-            for action in range(3):
-                after = self._move(state, action)
-                next_state[index, action] = self._index[after]
-                door[index, action] = self._door(state, after)
-                goal[index, action] = self.goal_cell == after[:2] != state[:2]
+        found = _outcomes(self.size, len(self.door_cells))
+        next_state, door, goal = (column.clone() for column in found)
         observation = torch.from_numpy(np.stack([self._observation(*s) for s in self.states]))
         state_of = torch.arange(num_states).unsqueeze(1).expand(shape)
         steps = TensorDict(
@@ -225,15 +220,28 @@ class TwoDoors(MiniGridEnv):
         x, y = self.agent_pos
         return int(x), int(y), int(self.agent_dir)
 
+    def outcome(self, state: int, action: int) -> tuple[int, int, bool]:
+        """Return the next state, the door that is gone through or -1, and whether the goal is."""
+        before = self.states[state]
+        after = self._move(before, action)
+        goal = self.goal_cell == after[:2] != before[:2]
+        return self._index[after], self._door(before, after), goal
+
     def _gen_grid(self, width: int, height: int) -> None:
-        self.grid = Grid(width, height)
-        self.grid.wall_rect(0, 0, width, height)
-        self.grid.vert_wall(self.wall, 0)
-        for cell, colour in zip(self.door_cells, _DOOR_COLOURS, strict=False):
-            self.grid.set(*cell, Floor(colour))
-        self.grid.set(*self.goal_cell, Goal())
+        if self._laid_out is None:
+            self._laid_out = self._lay_out(width, height)
+        self.grid = self._laid_out  # which no action changes
         x, y, direction = self._first[int(self.np_random.integers(len(self._first)))]
         self.agent_pos, self.agent_dir = (x, y), direction
+
+    def _lay_out(self, width: int, height: int) -> Grid:
+        grid = Grid(width, height)
+        grid.wall_rect(0, 0, width, height)
+        grid.vert_wall(self.wall, 0)
+        for cell, colour in zip(self.door_cells, _DOOR_COLOURS, strict=False):
+            grid.set(*cell, Floor(colour))
+        grid.set(*self.goal_cell, Goal())
+        return grid
 
     def _observation(self, x: int, y: int, direction: int) -> NDArray[np.float32]:
         side = self.size - 2
@@ -253,6 +261,18 @@ class TwoDoors(MiniGridEnv):
         if before[0] < self.wall and after[0] == self.wall:
             return self.door_cells.index(after[:2])
         return -1
+
+
+@cache
+def _outcomes(size: int, doors: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return next state, door and goal of every state and action, ``[S, 3]`` each.
+
+    Evaluation asks for a table dozens of times.
+    """
+    world = TwoDoors(size=size, doors=doors)
+    rows = [[world.outcome(s, action) for action in range(3)] for s in range(len(world.states))]
+    columns = torch.tensor(rows)
+    return columns[..., 0], columns[..., 1], columns[..., 2].bool()
 
 
 @env("two_doors")

@@ -9,6 +9,7 @@ in order yet.
 import gc
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -64,16 +65,19 @@ def is_asked_to_end() -> bool:
 def importing(*, always: bool = False) -> Iterator[None]:
     """Leave at once at Ctrl-C or SIGTERM, for a block that imports libraries in a command.
 
-    Nothing of them is garbage, so that none is looked for meanwhile: a second of five.
+    Nothing of them is garbage, so that none is looked for meanwhile, a second of five, and what is
+    new is left out of later searches, another half.
 
     Args:
         always: Also before the command listens.
     """
-    collects = gc.isenabled()
+    collects, known = gc.isenabled(), len(sys.modules)
     gc.disable()
     try:
         with _leaving(always=always):
             yield
+        if len(sys.modules) > known:  # else whatever there is may well be garbage
+            gc.freeze()
     finally:
         if collects:
             gc.enable()

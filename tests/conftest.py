@@ -4,12 +4,10 @@ import gc
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from hydra.core.hydra_config import HydraConfig
 from hypothesis import settings
 
-import popl_rl.trainers.run_benchmark
-import popl_rl.trainers.train_popl  # noqa: F401 - they make the schemas known to Hydra
+import popl_rl.trainers.run_benchmark  # noqa: F401 - it makes the schemas known to Hydra
 from popl_rl.algorithms.problem import Problem
 from popl_rl.config import MethodConfig, Training
 from popl_rl.data.bank import SegmentBank
@@ -23,7 +21,8 @@ from popl_rl.raters.collector import collect_preferences
 from popl_rl.raters.groups import make_groups
 from popl_rl.raters.people import Raters
 from popl_rl.testing import likes_left, likes_right, tiny_env
-from popl_rl.trainers.typed import opened
+from popl_rl.trainers.composing import compose_settings
+from popl_rl.trainers.train_popl import run
 
 gc.disable()  # until everything is imported, of which nothing is garbage
 
@@ -95,12 +94,14 @@ def workers():
 @pytest.fixture(scope="session")
 def config_of():
     """What Hydra makes of overrides."""
+    return lambda *overrides, name="train": compose_settings(overrides, name=name)
 
-    def make(*overrides, name="train"):
-        with initialize_config_module("popl_rl.configs", version_base="1.3"):
-            return compose(name, overrides=opened(overrides))
 
-    return make
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory, config_of, tiny):
+    """The tiny run with its pictures, for tests that change nothing in its folder."""
+    folder = tmp_path_factory.mktemp("finished") / "runs" / "mine"
+    return run(config_of(*tiny, "evaluation.figures=true", f"run_dir={folder}"))
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from dataclasses import fields, is_dataclass
@@ -56,11 +57,10 @@ LAUNCHED = sorted({line for line in LINES if line.startswith(("python -m", "pyth
 
 
 @pytest.fixture(scope="module")
-def folder_with_a_run(tmp_path_factory, config_of, tiny):
+def folder_with_a_run(tmp_path_factory, finished):
     """A folder in which README files' ``runs/mine`` is a finished run."""
     folder = tmp_path_factory.mktemp("documented")
-    run_dir = folder / "runs" / "mine"
-    train_popl.run(config_of(*tiny, f"run_dir={run_dir}"))
+    shutil.copytree(finished.run_dir, folder / "runs" / "mine")
     return folder
 
 

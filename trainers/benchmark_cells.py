@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_module
-from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from popl_rl.config import plain, validate
@@ -24,7 +22,7 @@ from popl_rl.manifest import sealed
 from popl_rl.storage import write_json
 from popl_rl.trainers import train_popl
 from popl_rl.trainers.command import USER_ERRORS
-from popl_rl.trainers.typed import opened
+from popl_rl.trainers.composing import compose_settings
 
 # One core for each cell; a benchmark's own report takes the place of a log of each.
 _ALWAYS = ("logger=csv", "threads=1")
@@ -50,7 +48,7 @@ def make_tasks(cells: Sequence[Cell], run_dir: Path) -> list[Task]:
         if cell.overrides in configs:
             continue
         try:
-            configs[cell.overrides] = compose_train([*cell.overrides, *_ALWAYS])
+            configs[cell.overrides] = compose_settings([*cell.overrides, *_ALWAYS])
             validate(configs[cell.overrides])
         except USER_ERRORS as error:
             raise ValueError(f"cell {cell.name} cannot be run: {error}") from error
@@ -86,15 +84,6 @@ def run_task(task: Task) -> str | None:
         if log.stat().st_size == 0:
             log.unlink()
     return problem
-
-
-def compose_train(overrides: Sequence[str]) -> Any:
-    """Compose the configuration of ``popl-train`` from overrides, also inside of a Hydra job."""
-    given = opened(overrides)
-    if GlobalHydra.instance().is_initialized():  # inside of a Hydra job
-        return compose("train", overrides=given)
-    with initialize_config_module("popl_rl.configs", version_base="1.3"):
-        return compose("train", overrides=given)
 
 
 def _train(task: Task) -> None:

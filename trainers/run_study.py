@@ -17,10 +17,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hydra import compose, initialize_config_module
-
 from popl_rl.trainers import import_data, judge_people
 from popl_rl.trainers.command import USER_ERRORS, prepare
+from popl_rl.trainers.composing import compose_settings
 from popl_rl.trainers.terminal import steady_terminal
 
 if TYPE_CHECKING:
@@ -70,8 +69,7 @@ def _config(study: str, data: Path, out: Path, settings: Sequence[str]) -> Any:
         overrides = [f"resume={out / 'comparison'}"]
     else:
         overrides = [f"study={study}", f"data.load={data}", f"run_dir={out / 'comparison'}"]
-    with initialize_config_module("popl_rl.configs", version_base="1.3"):
-        return compose("people", overrides=[*overrides, *settings])
+    return compose_settings([*overrides, *settings], name="people")
 
 
 def _jailbreaks(folder: Path, out: Path, encode: str, settings: Sequence[str]) -> None:

@@ -14,6 +14,7 @@ import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -160,7 +161,7 @@ def write_metadata(run_dir: Path, *, command: Sequence[str]) -> None:
     entry: dict[str, Any] = {
         "started": datetime.now().astimezone().isoformat(timespec="seconds"),
         "command": shlex.join(command),
-        "git": git_state(Path(__file__).parents[1]),
+        "git": _own_state(),
         "platform": platform.platform(),
         "device": torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
         "versions": {
@@ -176,11 +177,18 @@ def write_metadata(run_dir: Path, *, command: Sequence[str]) -> None:
     write_json(path, entry)
 
 
+@cache
 def _version(package: str) -> str | None:
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return None
+
+
+@cache
+def _own_state() -> dict[str, Any] | None:
+    """Our own checkout when this process first asks, which is nearer to when it was imported."""
+    return git_state(Path(__file__).parents[1])
 
 
 def git_state(checkout: Path) -> dict[str, Any] | None:
@@ -201,8 +209,9 @@ def git_state(checkout: Path) -> dict[str, Any] | None:
 
     try:
         # An installed package may lie inside somebody else's checkout.
-        if Path(ask("rev-parse", "--show-toplevel")).resolve() != checkout.resolve():
+        top, commit = ask("rev-parse", "--show-toplevel", "HEAD").splitlines()
+        if Path(top).resolve() != checkout.resolve():
             return None
-        return {"commit": ask("rev-parse", "HEAD"), "dirty": bool(ask("status", "--porcelain"))}
+        return {"commit": commit, "dirty": bool(ask("status", "--porcelain"))}
     except (OSError, subprocess.SubprocessError):
         return None

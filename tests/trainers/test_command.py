@@ -52,11 +52,9 @@ def train(call, tiny):
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory, tiny, config_of):
-    """A finished run; not to be changed."""
-    folder = tmp_path_factory.mktemp("finished") / "run"
-    train_popl.run(config_of(*tiny, "evaluation.figures=true", f"run_dir={folder}"))
-    return folder
+def finished(finished):
+    """Folder of a finished run; not to be changed."""
+    return finished.run_dir
 
 
 @pytest.fixture

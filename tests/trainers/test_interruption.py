@@ -1,10 +1,12 @@
 """SIGTERM and Ctrl-C end a command in order, and a killed sweep can be run again."""
 
+import gc
 import os
 import signal
 import subprocess
 import sys
 import threading
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -150,3 +152,16 @@ def test_ctrl_c_while_libraries_are_imported_is_no_traceback(number):
     )
     assert done.returncode == 128 + number
     assert done.stderr == "\ninterrupted before anything was begun\n"
+
+
+def test_what_is_imported_is_left_out_of_garbage_collections(tmp_path, monkeypatch):
+    (tmp_path / "never_seen_before.py").write_text("kept = [[] for _ in range(1000)]\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    before = gc.get_freeze_count()
+    with importing():
+        pass
+    assert gc.get_freeze_count() == before, "nothing is new, and there may be garbage"
+    with importing():
+        import_module("never_seen_before")
+    assert gc.get_freeze_count() >= before + 1000
+    assert gc.isenabled()

@@ -77,7 +77,7 @@ def _elsewhere(monkeypatch, tmp_path):
     Path("mine.yaml").write_text(SUITE)
 
 
-compose = cache(benchmark_cells.compose_train)
+compose = cache(benchmark_cells.compose_settings)
 
 
 def nothing_to_draw(suite, results):
@@ -90,7 +90,7 @@ def trainer(monkeypatch):
     monkeypatch.setattr(benchmark_cells.train_popl, "run", trainer)
     # Both take longer than all the rest.
     monkeypatch.setattr(
-        benchmark_cells, "compose_train", lambda overrides: compose(tuple(overrides))
+        benchmark_cells, "compose_settings", lambda overrides: compose(tuple(overrides))
     )
     monkeypatch.setattr(benchmark_report, "scenario_bars", nothing_to_draw)
     return trainer
