@@ -4,6 +4,8 @@ The smallest continuous world: a pole is to be kept upright on a cart, and an ep
 falls. Nobody is content with the middle.
 """
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -45,6 +47,21 @@ def to_the_right(step: TensorDictBase, generator: torch.Generator) -> Tensor:  #
 def balance(step: TensorDictBase, generator: torch.Generator) -> Tensor:  # noqa: ARG001
     """Balance in the middle."""
     return _drive(step, 0.0)
+
+
+def _fits(env: Any) -> str | None:
+    """What speaks against these raters in an environment; left and right are words of many."""
+    space = env.observation_space
+    if space.shape == (4,):
+        return None
+    return (
+        "it is of CartPole, and reads the place of the cart, the first of four numbers observed, "
+        f"where {space} is observed; a function of yours is named as in my_raters.py:left"
+    )
+
+
+setattr(left, "fits", _fits)  # noqa: B010 - the type of a function has none
+setattr(right, "fits", _fits)  # noqa: B010
 
 
 def _closeness(segments: TensorDictBase, place: float) -> Tensor:

@@ -18,6 +18,7 @@ from popl_rl.plug_ins import PlugInError, call, defined, failure, is_foreign, lo
 from popl_rl.processes import Workers
 
 __all__ = [
+    "CheckedBehaviour",
     "CheckedEnv",
     "Collect",
     "check_behaviours",
@@ -240,15 +241,20 @@ def checked_behaviour(
         label: What messages call the behaviour.
         action_space: What actions may be.
     """
-    return (
-        _CheckedBehaviour(behaviour, name, label, action_space)
-        if is_foreign(behaviour)
-        else behaviour
-    )
+    if not is_foreign(behaviour):
+        return behaviour
+    return CheckedBehaviour(behaviour, name, label, action_space)
 
 
-class _CheckedBehaviour:
-    """See ``checked_behaviour``."""
+class CheckedBehaviour:
+    """A behaviour whose every action is checked.
+
+    Args:
+        behaviour: Maps observations ``[B]`` and a generator to actions.
+        name: What messages call the environment.
+        label: What messages call the behaviour.
+        space: What actions may be.
+    """
 
     def __init__(
         self, behaviour: Behaviour, name: str, label: str, space: gymnasium.Space[Any]
@@ -263,6 +269,13 @@ class _CheckedBehaviour:
             call("env", self.name, f"reset of {self.doing}", reset)
 
     def __call__(self, step: TensorDictBase, generator: torch.Generator) -> Tensor:
+        """Actions of B environments.
+
+        Raises:
+            PlugInError: If the behaviour fails.
+            TypeError: If it returns no actions of the space's kind, one for each environment.
+            ValueError: If they are not in the space.
+        """
         action = call("env", self.name, self.doing, self.behaviour, step, generator)
         with located(self.behaviour):
             self._check(action, len(step))

@@ -37,6 +37,7 @@ _BEST = {
     "ppo": "PPO on its utility",
     "oracle": "its oracle",
     "best_behaviour": "the best behaviour in the data",
+    "clone": "the clone of the data",
 }
 
 
@@ -84,7 +85,8 @@ def verdicts(results: pd.DataFrame, label: str) -> list[Verdict]:
     """Put into words how well each group is served, from returns and their standard errors.
 
     The best known for a group is the highest return among the optimum (where every transition is
-    known), PPO, the group's oracle and the best behaviour in the data. From above, the first that
+    known), PPO, the group's oracle, the best behaviour in the data and the clone of all of them,
+    whatever there is. From above, the first that
     holds:
 
     - ``ORACLE``: nothing that is known, or not even the oracle, is clearly better than random

@@ -1,6 +1,6 @@
 """From settings to what is learnt and by what: hypotheses, clone, problem, method, baselines."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,9 +34,18 @@ __all__ = [
     "build_method",
     "build_problem",
     "build_spec",
+    "check_answers",
     "check_baselines",
     "train_baselines",
 ]
+
+
+#: Why a group has no strict answer, and what to do: without raters, and with raters.
+_SILENT = (
+    "nobody is of this group: ask more raters (raters.count), or give it a larger share",
+    "its raters find both segments equally good in all of their {asked} answers, or skip: its "
+    "function may read what is the same in all segments",
+)
 
 
 def build_spec(config: MethodConfig, env: gymnasium.Env[Any, Any]) -> PolicySpec | RewardSpec:
@@ -216,6 +225,37 @@ def train_baselines(
         )
     weight = group_weights(_groups_of(problem.comparisons, preferences), num_groups)
     return train(GroupCPL(problem, weight=weight, generator=generator), progress=progress)
+
+
+def check_answers(
+    config: EvaluationConfig,
+    comparisons: Comparisons,
+    preferences: TensorDictBase,
+    names: Sequence[str],
+) -> None:
+    """Raise, before anything is trained, if a group's oracle would have nothing to learn from.
+
+    Args:
+        config: Whether there will be oracles.
+        comparisons: What is learnt from, of the preferences.
+        preferences: With the hidden groups; without them nothing is checked.
+        names: What messages call the groups.
+
+    Raises:
+        ValueError: If a group has no strict answer.
+    """
+    if not config.baselines or config.baselines_from is not None:
+        return
+    if GROUP not in preferences.keys(True):
+        return
+    answers = preferences[GROUP].bincount(minlength=len(names)).tolist()
+    strict = _groups_of(comparisons, preferences).bincount(minlength=len(names)).tolist()
+    for name, asked, told in zip(names, answers, strict, strict=True):
+        if told == 0:
+            raise ValueError(
+                f"raters.groups: {name!r} has no strict answer, so no oracle can be trained for "
+                "it; " + _SILENT[asked > 0].format(asked=asked)
+            )
 
 
 def _groups_of(comparisons: Comparisons, preferences: TensorDictBase) -> Tensor:

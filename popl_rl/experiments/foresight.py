@@ -61,7 +61,7 @@ class Foresight:
         method = self.config.method
         left = max(self.method.generations - generation, 0)
         per_step = seconds * self.method.generations / method.training.steps
-        total, parts = left * seconds, [f"{left} generations"]
+        total, parts = left * seconds, [f"{left} generation{'s' * (left != 1)}"]
         steps = last_training(method, self.method)
         if steps is not None:
             most = (method.refinement.folds + 1) * method.refinement.most

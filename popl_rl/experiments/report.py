@@ -34,7 +34,8 @@ _SHARES = ("success", "accuracy")
 
 _WORDS = {
     "served": "new raters are given at least 0.8 of the best known, as far as the episodes tell: "
-    "optimum, PPO, oracle, or best behaviour in the data, whichever has the highest return.",
+    "optimum, PPO, oracle, best behaviour in the data or clone of all of them, whichever has the "
+    "highest return.",
     "no better than the data": "nothing was gained over what the data show, in their shares.",
     "its oracle does not act": "a policy that is told the group's own answers is no better than "
     "random actions, or worse than the data, so that a recovery means nothing: give all methods "

@@ -21,6 +21,7 @@ from popl_rl.experiments.builders import (
     build_method,
     build_problem,
     build_spec,
+    check_answers,
     train_baselines,
 )
 from popl_rl.experiments.data import Data, given_data, make_data
@@ -130,6 +131,8 @@ def gather(config: Config, run_dir: Path, place: Place) -> Setting:
         cases=config.method.cases,
         ties=config.method.ties,  # type: ignore[arg-type]
     )
+    names = [group.name for group in groups]
+    check_answers(config.evaluation, comparisons, data.preferences, names)
     clone, typical = None, None
     if config.method.evolve == "code" or config.evaluation.reference == "clone":
         with Progress("cloning", total=config.method.clone.steps) as progress:

@@ -40,7 +40,7 @@ _MARKED = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 @dataclass(frozen=True)
 class ResultTable:
-    """One measure of methods (rows) in scenarios (columns).
+    """One measure of methods (rows) in scenarios (columns), or the other way round.
 
     Attributes:
         suite: The suite whose rows it shows.
@@ -51,6 +51,7 @@ class ResultTable:
             for measures of all groups together.
         against: Method and choice that the others are subtracted from, seed by seed; None to show
             them as they are.
+        transposed: Whether scenarios are rows, and methods columns: for many scenarios.
     """
 
     suite: str
@@ -59,6 +60,7 @@ class ResultTable:
     scenarios: Mapping[str, str]
     over: Over = "worst"
     against: Entry | None = None
+    transposed: bool = False
 
     def rows(self, results: pd.DataFrame) -> pd.DataFrame:
         """Rows that the table is made from.
@@ -98,12 +100,13 @@ class ResultTable:
         value = values_by_seed(self.rows(results), self.over)
         places = [(entry, scenario) for entry in self.methods for scenario in self.scenarios]
         cells = dict(zip(places, self._cells(value, places), strict=True))
-        lines = [
-            [label, *(cells[entry, scenario] for scenario in self.scenarios)]
-            for entry, label in self.methods.items()
-        ]
-        head = ["method", *self.scenarios.values()]
-        return markdown_table(head, lines, right=len(self.scenarios))
+        grid = [[cells[entry, scenario] for scenario in self.scenarios] for entry in self.methods]
+        corner, down, across = "method", self.methods.values(), self.scenarios.values()
+        if self.transposed:
+            grid = [list(column) for column in zip(*grid, strict=True)]
+            corner, down, across = "scenario", across, down
+        lines = [[label, *line] for label, line in zip(down, grid, strict=True)]
+        return markdown_table([corner, *across], lines, right=len(across))
 
     def _cells(
         self,
@@ -199,8 +202,8 @@ def read_tables(path: Path) -> dict[str, Table]:
         path: A TOML file with a section for each table: ``suite``, ``measure``, ``methods`` (a list
             of ``[method, choice, label]``) and ``scenarios`` (name = title); or, of real people,
             ``columns`` (a list of ``[group, measure, title]``) in the place of ``measure`` and
-            ``scenarios``. ``over`` and ``against`` as in `ResultTable`. With ``wins_of = [method,
-            choice]`` and a list ``measures`` it is a `WinsTable`.
+            ``scenarios``. ``over``, ``against`` and ``transposed`` as in `ResultTable`. With
+            ``wins_of = [method, choice]`` and a list ``measures`` it is a `WinsTable`.
 
     Returns:
         The tables by name.
@@ -237,7 +240,8 @@ def _table(about: Mapping[str, Any]) -> Table:
     if "against" in about:
         method, choice = about["against"]
         against = (method, choice)
-    return ResultTable(about["suite"], about["measure"], methods, scenarios, over, against)
+    shown = about["suite"], about["measure"], methods, scenarios, over, against
+    return ResultTable(*shown, transposed=about.get("transposed", False))
 
 
 def rows_for(tables: Mapping[str, Table], results: pd.DataFrame) -> pd.DataFrame:

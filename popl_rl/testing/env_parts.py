@@ -6,18 +6,22 @@ Each raises, with a cure, for what training trips over, and warns of what it doe
 """
 
 import warnings
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tensordict import TensorDict
 from torchrl import logger
 from torchrl.envs import GymWrapper
 from torchrl.envs.utils import check_env_specs
 
+from popl_rl.data.adapters import native_spaces
 from popl_rl.data.behaviours import first_action
 from popl_rl.data.environments import counting_from_zero, offered
+from popl_rl.data.plugged import CheckedBehaviour
 from popl_rl.data.rollouts import numeric_info
 from popl_rl.data.tables import Table
 from popl_rl.keys import ACTION, INFO, OBSERVATION, REWARD
@@ -26,6 +30,7 @@ from popl_rl.testing.plug_ins import Env
 
 __all__ = [
     "Step",
+    "check_acting",
     "check_repeats",
     "check_spaces",
     "check_table",
@@ -165,6 +170,44 @@ def check_repeats(name: str, first: list[Step], second: list[Step]) -> None:
                 stacklevel=3,
             )
             return
+
+
+def check_acting(name: str, env: Env, found: Mapping[str, Any], steps: list[Step]) -> None:
+    """Check that behaviours that are functions act: at resets of three environments, and later on.
+
+    Args:
+        name: What messages call the environment.
+        env: The environment, as training sees it.
+        found: Its behaviours.
+        steps: What it said to random actions, the first a reset.
+    """
+    native = native_spaces(env)[1]
+    told = dict.fromkeys(key for step in steps for key in step.info)
+    situations = [_seen([steps[0]] * 3, steps[0].info), _seen(steps[:8], told)]
+    for label, what in found.items():
+        if not callable(what):
+            continue
+        checked = CheckedBehaviour(what, name, label, native)
+        checked.reset()
+        for situation in situations:
+            one, again = (
+                checked(situation.clone(), torch.Generator().manual_seed(0)) for _ in range(2)
+            )
+            if not torch.equal(one, again):
+                warnings.warn(
+                    f"env {name!r}: behaviour {label!r} should take the same actions where it sees "
+                    "the same and is given generators of one seed, but they differ, so that no "
+                    "data can be repeated; draw from the generator alone.",
+                    stacklevel=3,
+                )
+                break
+
+
+def _seen(steps: list[Step], names: Iterable[str]) -> TensorDict:
+    """What behaviours are shown of steps, ``[B]``; 0 for numbers that one does not tell."""
+    about = {key: torch.tensor([step.info.get(key, 0.0) for step in steps]) for key in names}
+    shown = torch.from_numpy(np.stack([step.observation for step in steps]))
+    return TensorDict({OBSERVATION: shown, INFO: TensorDict(about, len(steps))}, len(steps))
 
 
 def check_table(name: str, table: Any, env: Env, steps: list[Step]) -> None:

@@ -6,6 +6,7 @@ from popl_rl.data.environments import offered
 from popl_rl.data.plugged import check_behaviours
 from popl_rl.plug_ins import call
 from popl_rl.testing.env_parts import (
+    check_acting,
     check_repeats,
     check_spaces,
     check_table,
@@ -35,7 +36,8 @@ def check_env(env: EnvReference, *, num_steps: int = 200, seed: int = 0, **argum
 
     Warns:
         UserWarning: Of what training does not mind: episodes that a seed does not repeat,
-            observations out of their space, and what TorchRL's own check finds.
+            observations out of their space, behaviours that a generator does not repeat, and what
+            TorchRL's own check finds.
 
     Example:
         >>> from popl_rl.testing import check_env, tiny_env
@@ -52,4 +54,6 @@ def check_env(env: EnvReference, *, num_steps: int = 200, seed: int = 0, **argum
         if offered(made, "behaviours"):
             found = call("env", name, "behaviours", offered(made, "behaviours"))
             check_behaviours(name, found)
+            if offered(made, "collect_segments") is None:
+                check_acting(name, made, found, steps)
         check_torchrl(name, made)

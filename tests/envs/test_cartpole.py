@@ -8,6 +8,7 @@ from popl_rl.envs.cartpole import left, right
 from popl_rl.evaluation.acting import Rolling
 from popl_rl.evaluation.measures import group_returns
 from popl_rl.experiments.data import build_groups, build_world
+from popl_rl.testing import tiny_env
 
 
 def test_utilities_by_place():
@@ -16,6 +17,12 @@ def test_utilities_by_place():
     steps = TensorDict({"observation": observation}, [1, 7])
     assert left(steps).tolist() == [[0, 0, 1, 0.25, 0, 0, 0]]
     assert right(steps).tolist() == [[0, 0, 0, 0, 0, 0.5, 1]]
+
+
+def test_raters_of_the_same_name_elsewhere_are_not_meant(config_of):
+    for rater in (left, right):
+        assert rater.fits(build_world(plain(config_of("env=cartpole")).env).env.unwrapped) is None
+        assert "as in my_raters.py:left" in rater.fits(tiny_env())
 
 
 def test_each_group_finds_its_script_in_the_data(config_of):

@@ -46,6 +46,8 @@ def table(**returns):
         (DATA, "its oracle", {"popl": 1.0, "oracle": 100}),
         # The oracle is poor, and the set is not.
         (SERVED, "the optimum", {"popl": 90, "oracle": 0, "optimum": (100, 0.0)}),
+        # The oracle is poorer than what was cloned without any answer.
+        (PARTLY, "the clone of the data", {"popl": 70, "oracle": 60, "clone": 100}),
         (SERVED, "PPO", {"popl": 90, "oracle": 50, "ppo": 100}),
     ],
 )

@@ -10,7 +10,7 @@ from popl_rl.algorithms.variation import GaussianHead, GradientCPL
 from popl_rl.config import EvaluationConfig, Training
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
-from popl_rl.experiments.builders import train_baselines
+from popl_rl.experiments.builders import check_answers, train_baselines
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.randomness import stream
@@ -169,3 +169,24 @@ def test_oracles_are_told_whose_ties_are_whose(ties):
     assert slope[1] > 0.1
     assert slope[2] < -0.1
     assert slope[0].abs() < slope[1:].abs().min() / 2
+
+
+def test_groups_that_prefer_nothing_are_named_before_anything_is_trained():
+    """Raters of "level" find everything equally good; nobody belongs to "absent"."""
+    pair = torch.tensor([[0, 1], [1, 2], [0, 2], [2, 1]])
+    said = {"answer": torch.tensor([0, 1, 2, 2]), "hidden": {"group": torch.tensor([0, 0, 1, 1])}}
+    preferences = TensorDict({"pair": pair, "rater": pair[:, 0] * 0, **said}, [4])
+    comparisons = Comparisons.from_preferences(preferences, cases="rater")
+
+    def check(names, **options):
+        check_answers(EvaluationConfig(**options), comparisons, preferences, names)
+
+    with pytest.raises(ValueError, match=r"'level' has no strict .* in all of their 2 answers"):
+        check(["keen", "level"])
+    preferences["answer"][2] = 0
+    comparisons = Comparisons.from_preferences(preferences, cases="rater")
+    check(["keen", "level"])
+    with pytest.raises(ValueError, match=r"'absent' has no strict .*nobody is of this group: ask"):
+        check(["keen", "level", "absent"])
+    check(["keen", "level", "absent"], baselines=False)
+    check(["keen", "level", "absent"], baselines_from="runs/other/baselines")

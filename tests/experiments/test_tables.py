@@ -26,6 +26,19 @@ def test_a_cell_is_the_worst_group_over_seeds():
     assert lines[-1] == "| `popl` | 0.50 [0.40] | – |", "two seeds tell no interval"
 
 
+def test_scenarios_may_be_rows():
+    rows = [("s", "two", 0, m, "", "a", "success", v) for m, v in (("popl", 1.0), ("cpl", 0.5))]
+    methods = {("popl", ""): "`popl`", ("cpl", ""): "pooled CPL"}
+    scenarios = {"two": "two groups", "three": "three groups"}
+    table = ResultTable("s", "success", methods, scenarios, transposed=True)
+    assert table.markdown(pd.DataFrame(rows, columns=COLUMNS)).splitlines() == [
+        "| scenario | `popl` | pooled CPL |",
+        "| --- | ---: | ---: |",
+        "| two groups | 1.00 [1.00] | 0.50 [0.50] |",
+        "| three groups | – | – |",
+    ]
+
+
 @pytest.mark.parametrize(("value", "shown"), [(-0.004, "0.00"), (-0.5, "−0.50"), (1.0, "1.00")])
 def test_numbers_have_two_decimals_and_a_minus_sign(value, shown):
     rows = pd.DataFrame([("s", "two", 0, "cpl", "", "a", "return", value)], columns=COLUMNS)

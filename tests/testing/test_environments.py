@@ -92,6 +92,16 @@ class Failing(Good):
         raise RuntimeError("the motor is stuck")
 
 
+def functional(step, generator):
+    """Acts by observations and by all that is told at a reset."""
+    info, drawn = step["info", "state"], torch.rand(len(step), generator=generator)
+    return ((step["observation"][:, 0] + drawn + info) > 1).long()
+
+
+def by_the_speed(step, generator):
+    return step["info", "speed"].long()
+
+
 class Behaving(Good):
     def __init__(self, found):
         super().__init__(max_steps=20)
@@ -220,6 +230,31 @@ BROKEN_ENVS = {
         ValueError,
         "row of behaviour 'odd'.*softmax",
     ),
+    "behaviour gives fractions": (
+        lambda: Behaving({"own": functional, "odd": lambda step, _: torch.zeros(len(step))}),
+        TypeError,
+        r"behaviour 'odd' must return whole numbers \[3\], got torch.float32",
+    ),
+    "behaviour gives one action": (
+        lambda: Behaving({"odd": lambda *_: torch.zeros(1).long()}),
+        TypeError,
+        r"behaviour 'odd' must return whole numbers \[3\], got torch.int64 of shape \[1\]",
+    ),
+    "behaviour leaves the space": (
+        lambda: Behaving({"odd": lambda step, _: torch.full((len(step),), 2)}),
+        ValueError,
+        r"behaviour 'odd' must return actions in 0\.\.1, got 2\.\.2",
+    ),
+    "behaviour takes one argument": (
+        lambda: Behaving({"odd": lambda step: torch.zeros(len(step)).long()}),
+        ValueError,
+        "behaviour 'odd' failed with TypeError",
+    ),
+    "behaviour reads what no reset tells": (
+        lambda: Behaving({"odd": by_the_speed}),
+        ValueError,
+        """behaviour 'odd' failed with KeyError.*"speed" not found""",
+    ),
 }
 
 
@@ -269,6 +304,10 @@ WARNED = {
         "should lie in Box.*values from 0 to 7.*correct the space",
     ),
     "terminated is a number": (stepping(terminated=0), "TorchRL's check_env_specs failed"),
+    "behaviour by other chance": (
+        lambda: Behaving({"odd": lambda step, _: torch.randint(2, (len(step),))}),
+        "behaviour 'odd' should take the same actions.*draw from the generator alone",
+    ),
     "unseeded": (lambda: Unseeded(20), "same seed and actions.*self.np_random only"),
 }
 
@@ -293,7 +332,7 @@ def test_an_environment_can_be_given_in_three_ways():
     check_env(tiny_env)
     check_env(tiny_env())
     check_env("popl_rl.testing:tiny_env", max_steps=3)
-    check_env(lambda: Behaving({"left": torch.eye(2)[[0] * 5], "own": lambda *_: 0}))
+    check_env(lambda: Behaving({"left": torch.eye(2)[[0] * 5], "own": functional}))
     with pytest.raises(TypeError, match="or a reference to it, got a int"):
         check_env(3)
     with pytest.raises(TypeError, match="takes no arguments"):
