@@ -15,6 +15,12 @@ __all__ = ["as_typed", "opened"]
 
 #: Groups of settings that are chosen by a name, each with a choice.
 _GROUPS = {"env": "two_doors", "raters": "two_groups", "method": "popl", "logger": "csv"}
+#: Of groups in which something of one's own may be named, where its reference goes.
+_OWN = {
+    "env": "env=custom env.factory={}",
+    "raters": "raters=own raters.groups=[{}]",
+    "method": "method.factory={}",
+}
 #: A name, quoted or not.
 _NAME = re.compile(r"""['"]?[\w./-]*[A-Za-z][\w./-]*['"]?""")
 #: A sweep with a function.
@@ -61,12 +67,19 @@ def as_typed(arguments: Sequence[str], schema: type) -> list[str]:
         if key in _GROUPS and equals and not _is_choice(value):
             raise ValueError(
                 f"{key} must be a choice by its name, as in {key}={_GROUPS[key]}, got {argument}; "
-                f"settings of it are given one by one, as in {key}.name=value"
+                f"{_own(key, value)}"
             )
         if equals and key.lstrip("+") in texts:
             argument = f"{key}={','.join(_quoted(part, parser) for part in value.split(','))}"
         kept.append(argument)
     return kept
+
+
+def _own(key: str, value: str) -> str:
+    """How to say what somebody may have meant who gave a group something else than a name."""
+    if key in _OWN and ":" in value and value[0] not in "{[":
+        return f"one of yours is named as in {_OWN[key].format(value)}"
+    return f"settings of it are given one by one, as in {key}.name=value"
 
 
 def _is_choice(value: str) -> bool:

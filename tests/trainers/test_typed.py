@@ -111,6 +111,20 @@ def test_a_group_of_settings_is_chosen_by_name(typed):
 
 
 @pytest.mark.parametrize(
+    ("typed", "cure"),
+    [
+        ("env=line.py:Line", r"as in env=custom env\.factory=line\.py:Line$"),
+        ("raters=mine.py:left", r"as in raters=own raters\.groups=\[mine\.py:left\]$"),
+        ("method=mine.py:Noisy", r"as in method\.factory=mine\.py:Noisy$"),
+        ("method={name:popl}", r"as in method\.name=value$"),
+    ],
+)
+def test_a_reference_in_the_place_of_a_choice_is_told_where_it_goes(typed, cure):
+    with pytest.raises(ValueError, match=cure):
+        as_typed([typed], Config)
+
+
+@pytest.mark.parametrize(
     "typed", ["env=metaworld/any", "method='popl'", "raters=a,b", "method=glob(popl*)"]
 )
 def test_choices_and_sweeps_of_them_are_names(typed):
