@@ -2,7 +2,8 @@
 
 Every rule is a function of the members' values on the cases: who becomes a parent, and nothing
 else. The first three see no more of a member than the sum of its values, so that a member that
-serves a small group alone has no chance; NSGA-II keeps the cases apart.
+serves a small group alone has no chance; NSGA-II keeps the cases apart, and ``single_case`` asks
+one of them.
 """
 
 from collections.abc import Callable
@@ -25,6 +26,7 @@ __all__ = [
     "random_selection",
     "report",
     "selection_rule",
+    "single_case_selection",
     "tournament_selection",
 ]
 
@@ -99,6 +101,33 @@ def best_sum_selection(
     most = -int(-share * len(values) // 1)
     best = values.double().sum(1).argsort(descending=True, stable=True)[:most]
     return best[_draw(most, (num_selected,), values, generator)]
+
+
+def single_case_selection(
+    values: Tensor, num_selected: int, *, generator: torch.Generator
+) -> Tensor:
+    """The best on a single random case, a draw among those equally good: lexicase's first step.
+
+    What lexicase gains over this, it gains by going on to further cases.
+
+    Args:
+        values: ``[member, case]``, higher is better.
+        num_selected: Parents to select, each for a case of its own.
+        generator: Source of the cases and of the draws.
+
+    Returns:
+        Parents, ``[num_selected]``.
+
+    Raises:
+        TypeError: ``num_selected`` is not an int.
+        ValueError: ``values`` is no matrix of numbers, or ``num_selected`` is below 1.
+    """
+    _check(values, num_selected, generator)
+    case = _draw(values.shape[1], (num_selected,), values, generator)
+    asked = values.T[case]
+    is_best = asked == asked.amax(1, keepdim=True)
+    ticket = torch.rand(is_best.shape, generator=generator, device=values.device)
+    return ticket.masked_fill(~is_best, -1.0).argmax(1)
 
 
 def random_selection(values: Tensor, num_selected: int, *, generator: torch.Generator) -> Tensor:
@@ -185,6 +214,7 @@ SELECTIONS: dict[str, Callable[..., Tensor]] = {
     "tournament": tournament_selection,
     "best_sum": best_sum_selection,
     "random": random_selection,
+    "single_case": single_case_selection,
     "nsga2": nsga2_selection,
 }
 """Rules by name."""

@@ -19,6 +19,7 @@ from popl_rl.selection.rules import (
     random_selection,
     report,
     selection_rule,
+    single_case_selection,
     tournament_selection,
 )
 
@@ -65,6 +66,14 @@ def test_the_best_quarter_by_sum(generator):
     # A quarter of five members, rounded up, is two of them.
     five = torch.tensor([[1.0], [5.0], [3.0], [4.0], [2.0]])
     assert set(best_sum_selection(five, 50, generator=generator).tolist()) == {1, 3}
+
+
+def test_the_best_on_a_single_case_by_hand(generator):
+    """Case 0 has one best member, 0; on case 1 members 1 and 3 are equally good: 1/2, 1/4, 1/4."""
+    values = torch.tensor([[0.9, 0.1], [0.4, 0.8], [0.6, 0.7], [0.1, 0.8]])
+    counts = single_case_selection(values, 8000, generator=generator).bincount(minlength=4)
+    assert counts[2] == 0, "second on both cases, so never selected"
+    assert chisquare(counts[[0, 1, 3]], [4000, 2000, 2000]).pvalue > 1e-4
 
 
 def test_random_parents_are_uniform(generator):
