@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
-
 from popl_rl.config import plain, validate
 from popl_rl.experiments.cells import Cell, is_finished, results_digest
 from popl_rl.experiments.costs import peak_memory, size_of
 from popl_rl.experiments.progress import without_lines
+from popl_rl.experiments.run_manifest import config_text
 from popl_rl.locks import HeldError, locked
 from popl_rl.manifest import sealed
 from popl_rl.storage import write_json
@@ -117,8 +116,7 @@ def _train(task: Task) -> None:
 def _resume(config: Any, folder: Path) -> bool:
     """Finish what a killed process has left, if that is the same run; whether it worked."""
     stored = folder / "config.yaml"
-    wanted = OmegaConf.to_yaml(OmegaConf.structured(plain(config)), resolve=True)
-    if not stored.is_file() or stored.read_text("utf-8") != wanted:
+    if not stored.is_file() or stored.read_text("utf-8") != config_text(plain(config)):
         return False
     again = copy.deepcopy(config)
     again.resume = str(folder)

@@ -97,6 +97,8 @@ def find_plug_ins(run_dir: Path, config: DictConfig, kept: Mapping[str, Any]) ->
                 stacklevel=2,
             )
         moved[named] = str(folder / here.name)
+    if not moved:
+        return config
     found: DictConfig = OmegaConf.create(_renamed(OmegaConf.to_container(config), moved))
     return found
 

@@ -7,6 +7,7 @@ no manifest; they are read as they were, and their data and sets with warnings.
 
 import uuid
 from collections.abc import Mapping
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ __all__ = [
     "check_own",
     "check_own_data",
     "config_text",
+    "container",
     "is_run_of",
     "load_run_config",
     "run_id",
@@ -30,11 +32,16 @@ __all__ = [
 _FORMAT = "popl_rl.run/1"
 
 
+def container(config: Any) -> DictConfig:
+    """A DictConfig, dataclass or dict as a DictConfig; a dataclass's types take twice the time."""
+    if OmegaConf.is_config(config):
+        return config  # type: ignore[no-any-return]
+    return OmegaConf.create(asdict(config) if is_dataclass(config) else config)  # type: ignore[arg-type]
+
+
 def config_text(config: Any) -> str:
     """What ``config.yaml`` says of a DictConfig, dataclass or dict, with references resolved."""
-    if not OmegaConf.is_config(config):
-        config = OmegaConf.create(config)
-    return OmegaConf.to_yaml(config, resolve=True)
+    return OmegaConf.to_yaml(container(config), resolve=True)
 
 
 def is_run_of(run_dir: Path, config: Any) -> bool:
@@ -62,8 +69,7 @@ def write_run_manifest(run_dir: Path, config: Any) -> None:
     Raises:
         OSError: If it cannot be written.
     """
-    if not OmegaConf.is_config(config):
-        config = OmegaConf.create(config)
+    config = container(config)
     content = {
         "format": _FORMAT,
         "run": uuid.uuid4().hex,

@@ -19,7 +19,7 @@ from popl_rl.experiments.run_folder import (
     save_config,
     write_metadata,
 )
-from popl_rl.experiments.run_manifest import load_run_config, write_run_manifest
+from popl_rl.experiments.run_manifest import container, load_run_config, write_run_manifest
 from popl_rl.interruption import Terminated
 from popl_rl.memory import keep_freed_memory
 from popl_rl.processes import Workers, workers_for
@@ -69,7 +69,7 @@ def _new_run(config: Config, command: Sequence[str]) -> Iterator[Path]:
     """Make the folder of a run, and hold it."""
 
     def fill(folder: Path) -> None:
-        settings = OmegaConf.structured(config)  # once for both
+        settings = container(config)  # once for both
         write_run_manifest(folder, settings)
         save_config(folder, settings)
         write_metadata(folder, command=command)

@@ -70,7 +70,7 @@ def fit_value(
     scale = float(ahead.std().clamp(min=1e-6))
     with torch.random.fork_rng(devices=[]):
         # TorchRL initialises from the global generator only, so lend it a seed of ours.
-        torch.manual_seed(int(torch.randint(2**62, (), generator=generator)))
+        torch.default_generator.manual_seed(int(torch.randint(2**62, (), generator=generator)))
         network = MLP(flat.shape[1], 1, num_cells=list(_HIDDEN), activation_class=torch.nn.ReLU)
     value = Value(network, mean, std, scale)
     inputs, last = (flat - mean) / std, observation[:, -1]
