@@ -13,8 +13,8 @@ from torch import Tensor
 
 from popl_rl import registry
 from popl_rl.data import tables as planning
-from popl_rl.keys import ACTION, INFO, OBSERVATION
-from popl_rl.plug_ins import call, located
+from popl_rl.keys import ACTION, HIDDEN, INFO, OBSERVATION
+from popl_rl.plug_ins import PlugInError, call, located
 from popl_rl.raters.checks import checked
 from popl_rl.raters.response import Response
 
@@ -77,7 +77,12 @@ class RaterGroup:
             ValueError: If it fails, or its result has another shape or is not finite.
         """
         doing = f"judging segments of batch size {list(segments.batch_size)}"
-        result = call("rater", self.name, doing, self.utility, segments)
+        try:
+            result = call("rater", self.name, doing, self.utility, segments)
+        except PlugInError as error:
+            if not isinstance(error.__cause__, KeyError):
+                raise
+            raise PlugInError(f"{error}; {_held(segments)}") from error.__cause__
         with located(self.utility):
             return checked(result, segments, rater=self.name)
 
@@ -207,6 +212,13 @@ def make_groups(
             group = RaterGroup(name, utility, own, label, advantages, first_action=first)
         groups.append(group)
     return tuple(groups)
+
+
+def _held(segments: TensorDictBase) -> str:
+    """What raters may read, in words: a name that they miss is misspelt, or no info says it."""
+    told = [str(name) for name in segments.get(INFO, {}).keys()]  # noqa: SIM118 - no dict
+    read = [str(name) for name in segments.keys() if name not in (INFO, HIDDEN)]  # noqa: SIM118
+    return f"segments hold {', '.join(read)}, and in info {', '.join(told) or 'nothing'}"
 
 
 def _named(reference: str | Utility) -> tuple[str, Utility]:

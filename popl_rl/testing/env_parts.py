@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict
+from torch import Tensor
 from torchrl import logger
 from torchrl.envs import GymWrapper
 from torchrl.envs.utils import check_env_specs
@@ -188,11 +189,8 @@ def check_acting(name: str, env: Env, found: Mapping[str, Any], steps: list[Step
         if not callable(what):
             continue
         checked = CheckedBehaviour(what, name, label, native)
-        checked.reset()
         for situation in situations:
-            one, again = (
-                checked(situation.clone(), torch.Generator().manual_seed(0)) for _ in range(2)
-            )
+            one, again = _act(checked, situation), _act(checked, situation)
             if not torch.equal(one, again):
                 warnings.warn(
                     f"env {name!r}: behaviour {label!r} should take the same actions where it sees "
@@ -201,6 +199,11 @@ def check_acting(name: str, env: Env, found: Mapping[str, Any], steps: list[Step
                     stacklevel=3,
                 )
                 break
+
+
+def _act(behaviour: CheckedBehaviour, shown: TensorDict) -> Tensor:
+    behaviour.reset()  # of what it remembers of the episodes that it was in
+    return behaviour(shown.clone(), torch.Generator().manual_seed(0))
 
 
 def _seen(steps: list[Step], names: Iterable[str]) -> TensorDict:

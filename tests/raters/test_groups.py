@@ -281,9 +281,11 @@ def test_regret_where_actions_do_not_begin_with_0(segments, table):
 
 def test_what_a_rater_raises_is_the_cause(segments):
     group = RaterGroup("broken", lambda s: s["speed"], Response())
-    with pytest.raises(ValueError, match="broken") as caught:
-        group.step_utility(segments)
-    assert isinstance(caught.value.__cause__, KeyError)
+    for shown, told in ((segments, "state"), (segments.exclude("info"), "nothing")):
+        held = f"segments hold observation, action, reward, and in info {told}$"
+        with pytest.raises(ValueError, match=f"broken.*{held}") as caught:
+            group.step_utility(shown)
+        assert isinstance(caught.value.__cause__, KeyError)
 
 
 def test_regret_says_what_segments_lack(segments, table):

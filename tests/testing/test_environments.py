@@ -98,6 +98,18 @@ def functional(step, generator):
     return ((step["observation"][:, 0] + drawn + info) > 1).long()
 
 
+class Remembering:
+    """Goes on with what it began in each episode of a batch."""
+
+    def reset(self):
+        self.begun = None
+
+    def __call__(self, step, generator):
+        if self.begun is None:
+            self.begun = torch.randint(2, (len(step),), generator=generator)
+        return self.begun.clone()
+
+
 def by_the_speed(step, generator):
     return step["info", "speed"].long()
 
@@ -332,7 +344,9 @@ def test_an_environment_can_be_given_in_three_ways():
     check_env(tiny_env)
     check_env(tiny_env())
     check_env("popl_rl.testing:tiny_env", max_steps=3)
-    check_env(lambda: Behaving({"left": torch.eye(2)[[0] * 5], "own": functional}))
+    check_env(
+        lambda: Behaving({"left": torch.eye(2)[[0] * 5], "own": functional, "mind": Remembering()})
+    )
     with pytest.raises(TypeError, match="or a reference to it, got a int"):
         check_env(3)
     with pytest.raises(TypeError, match="takes no arguments"):
