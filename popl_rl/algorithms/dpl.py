@@ -13,6 +13,7 @@ from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.policies import PolicySpec, build_network
 from popl_rl.models.schedules import linear_decay
+from popl_rl.optim import adam
 
 __all__ = [
     "DistributionalReward",
@@ -292,7 +293,7 @@ def train_dpl(
     spec = PolicySpec(bank.observation.shape[1], outputs, True, tuple(hidden))
     device = bank.observation.device
     network = build_network(spec, generator=generator).to(device)
-    optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate)
+    optimizer = adam(network.parameters(), lr=learning_rate)
     schedule = linear_decay(optimizer, steps)
     for done in range(1, steps + 1):
         index = torch.randint(len(comparisons), (batch_size,), generator=generator, device=device)

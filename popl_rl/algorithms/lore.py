@@ -20,6 +20,7 @@ from popl_rl.models.population import Population
 from popl_rl.models.preference_likelihood import drawn_likelihood, log_likelihood
 from popl_rl.models.schedules import linear_decay
 from popl_rl.models.scoring import case_values, rater_accuracy
+from popl_rl.optim import adam
 
 __all__ = ["LoRe"]
 
@@ -157,7 +158,7 @@ class LoRe:
         with torch.no_grad():
             seen = self._look(pair)
         free = start.log().repeat(len(preferred), 1).requires_grad_()
-        optimizer = torch.optim.Adam([free], lr=self.settings.learning_rate)
+        optimizer = adam([free], lr=self.settings.learning_rate)
         for _ in range(self.settings.fit_steps):
             margin = self._margins(seen, pair, free.softmax(1))
             loss = -(log_likelihood(margin, self.problem.training.slip) * there).sum()

@@ -35,6 +35,7 @@ from popl_rl.models.policies import Spec
 from popl_rl.models.population import Population
 from popl_rl.models.preference_likelihood import log_likelihood
 from popl_rl.models.schedules import linear_decay
+from popl_rl.optim import adam
 from popl_rl.selection.lexicase import lexicase_report
 from popl_rl.selection.mad import mad
 from popl_rl.selection.rules import Selection, report
@@ -306,7 +307,7 @@ class MixturePOPL:
 
 def _trainer(problem: Problem, population: Population) -> tuple[CPLLoss, torch.optim.Adam]:
     rate = problem.training.learning_rate
-    return problem.loss(population), torch.optim.Adam(population.members.parameters(), lr=rate)
+    return problem.loss(population), adam(population.members.parameters(), lr=rate)
 
 
 def _visit_counts(bank: SegmentBank, spec: Spec, discount: float) -> Tensor | None:

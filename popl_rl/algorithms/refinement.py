@@ -20,6 +20,7 @@ from popl_rl.config import RefinementSettings
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.population import Population
 from popl_rl.models.preference_likelihood import InParts, per_case
+from popl_rl.optim import adam
 
 __all__ = ["refine", "smallest_subset"]
 
@@ -119,7 +120,7 @@ class _CrossFitting:
         self.copies = copies
         self.loss: CPLLoss = self.problem.loss(copies)
         rate = self.problem.training.learning_rate
-        self.optimizer = torch.optim.Adam(copies.members.parameters(), lr=rate)
+        self.optimizer = adam(copies.members.parameters(), lr=rate)
 
     def _likelihood(self, population: Population) -> InParts:
         """Log-likelihood of every comparison under every member, ``[N, M]``."""

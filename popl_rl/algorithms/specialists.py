@@ -12,6 +12,7 @@ from popl_rl.algorithms.problem import Problem
 from popl_rl.config import POPLSettings
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.population import Population
+from popl_rl.optim import adam
 
 __all__ = ["Specialists", "personalise", "specialists", "train_specialists"]
 
@@ -105,7 +106,7 @@ def personalise(
     everybody = torch.arange(comparisons.num_cases, device=raters.device)
     descend(
         loss,
-        torch.optim.Adam(loss.population.members.parameters(), lr=learning_rate),
+        adam(loss.population.members.parameters(), lr=learning_rate),
         own,
         steps=steps,
         batch_size=batch_size,

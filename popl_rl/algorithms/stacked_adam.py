@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from popl_rl.models.population import Population
+from popl_rl.optim import adam
 
 __all__ = ["StackedAdam"]
 
@@ -25,7 +26,7 @@ class StackedAdam:
 
     def __init__(self, population: Population, learning_rate: float) -> None:
         self.learning_rate = learning_rate
-        self.optimizer = torch.optim.Adam(population.members.parameters(), lr=learning_rate)
+        self.optimizer = adam(population.members.parameters(), lr=learning_rate)
 
     def moved_to(self, population: Population, source: Sequence[int] | Tensor) -> "StackedAdam":
         """The optimiser of another population, made of present members and of new ones.

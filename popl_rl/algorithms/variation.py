@@ -12,6 +12,7 @@ from popl_rl.algorithms.problem import Problem
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.population import Population
 from popl_rl.models.schedules import linear_decay
+from popl_rl.optim import adam
 
 __all__ = ["GaussianHead", "GradientCPL", "Variation", "inherit_moments"]
 
@@ -145,7 +146,7 @@ class GradientCPL:
         self.steps = steps
         self.batch_size = batch_size
         self.generator = generator
-        self.optimizer = torch.optim.Adam(loss.population.members.parameters(), lr=learning_rate)
+        self.optimizer = adam(loss.population.members.parameters(), lr=learning_rate)
         self.schedule = linear_decay(self.optimizer, generations)
 
     @classmethod

@@ -26,6 +26,7 @@ from popl_rl.models.population import Population
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.models.schedules import linear_decay
 from popl_rl.models.scoring import rater_accuracy
+from popl_rl.optim import adam
 from popl_rl.selection.farthest_first import farthest_first
 
 __all__ = ["VPL", "active_units", "divergence", "spread_points", "swap_guidance"]
@@ -145,7 +146,7 @@ class VPL:
         conditioned = replace(self.spec, observation_dim=self.spec.observation_dim + vpl.latent)
         self.network = build_network(conditioned, generator=generator).to(problem.device)
         parameters = [*self.encoder.parameters(), *self.network.parameters()]
-        self.optimizer = torch.optim.Adam(parameters, lr=problem.training.learning_rate)
+        self.optimizer = adam(parameters, lr=problem.training.learning_rate)
         self.schedule = linear_decay(self.optimizer, problem.generations)
 
     def step(self) -> dict[str, float]:

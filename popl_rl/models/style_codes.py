@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from popl_rl.data.bank import SegmentBank
 from popl_rl.models.policies import PolicySpec, build_network
 from popl_rl.models.schedules import linear_decay
+from popl_rl.optim import adam
 from popl_rl.storage import load_tensordict, read_manifest, save_tensordict
 
 __all__ = ["StyleClone", "load_clone", "save_clone", "train_clone"]
@@ -126,7 +127,7 @@ def train_clone(
     decoder, encoder = decoder.to(device), encoder.to(device)
     mean = bank.observation.mean(0)
     std = bank.observation.std(0).clamp(min=_LEAST_STD)
-    optimizer = torch.optim.Adam([*decoder.parameters(), *encoder.parameters()], lr=learning_rate)
+    optimizer = adam([*decoder.parameters(), *encoder.parameters()], lr=learning_rate)
     schedule = linear_decay(optimizer, -(-steps // _BLOCK))
     length = bank.row.shape[1]
 

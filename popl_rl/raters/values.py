@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.modules import MLP
 
 from popl_rl.keys import OBSERVATION
+from popl_rl.optim import adam
 from popl_rl.raters.groups import RaterGroup
 
 __all__ = ["Value", "fit_value", "with_values"]
@@ -74,7 +75,7 @@ def fit_value(
         network = MLP(flat.shape[1], 1, num_cells=list(_HIDDEN), activation_class=torch.nn.ReLU)
     value = Value(network, mean, std, scale)
     inputs, last = (flat - mean) / std, observation[:, -1]
-    optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate)
+    optimizer = adam(network.parameters(), lr=learning_rate)
     for done in range(_ROUNDS):
         # At first nothing is known of what comes after a segment.
         after = value(last) if done else torch.zeros(len(last))

@@ -22,6 +22,13 @@ from popl_rl.algorithms.trainer import MethodTrainer
 from popl_rl.experiments.metrics import MetricsWriter
 
 GENERATIONS = 40
+#: Runs a script without looking for garbage in what it imports.
+UNCOLLECTED = """
+import gc, runpy, sys
+gc.disable()
+del sys.argv[0]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
 
 
 class FakePOPL:
@@ -244,7 +251,7 @@ def test_a_run_that_is_killed_at_random_moments_ends_as_if_it_had_not_been(tmp_p
     killed.mkdir()
     popl = train_in(whole)
     # In a process of its own: forking one that runs threads, as pytest may, is unsafe.
-    script = [sys.executable, "-W", "error", __file__, str(killed)]
+    script = [sys.executable, "-W", "error", "-c", UNCOLLECTED, __file__, str(killed)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(script, capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 0, done.stderr
