@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from popl_rl.optim import adam
+from popl_rl.optim import adam, take_step
 
 SHAPES = [(3, 8, 14), (3, 8), (513,), (1,), ()]
 
@@ -87,3 +87,18 @@ def test_hooks_and_closures_are_called():
     ours.step()
     assert called == ["hook", "hook"]
     assert loss() < before
+
+
+def test_a_step_is_one_of_backward_and_leaves_other_gradients_alone():
+    optimizers, parameters = pair(shapes=[(3,), (2,)])
+    elsewhere = torch.ones(3, requires_grad=True)
+    for _ in range(3):
+        one, other = ((elsewhere * own[0]).exp().sum() for own in parameters)
+        optimizers[0].zero_grad()
+        one.backward()
+        optimizers[0].step()
+        elsewhere.grad = None
+        take_step(optimizers[1], other)
+        assert elsewhere.grad is None
+    assert_same(optimizers, parameters)
+    assert parameters[1][1].grad is None, "it is not asked"

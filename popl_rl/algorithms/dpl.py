@@ -13,7 +13,7 @@ from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.policies import PolicySpec, build_network
 from popl_rl.models.schedules import linear_decay
-from popl_rl.optim import adam
+from popl_rl.optim import adam, take_step
 
 __all__ = [
     "DistributionalReward",
@@ -299,9 +299,7 @@ def train_dpl(
         index = torch.randint(len(comparisons), (batch_size,), generator=generator, device=device)
         segment = torch.cat([comparisons.preferred[index], comparisons.other[index]])
         loss = _loss(kind, _step_outputs(network, bank, segment), entropy)
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        optimizer.step()
+        take_step(optimizer, loss)
         schedule.step()
         if done % _REPORT == 0 or done == steps:
             # NaN and infinity stay in the weights, so that looking now and then is enough.

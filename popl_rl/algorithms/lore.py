@@ -20,7 +20,7 @@ from popl_rl.models.population import Population
 from popl_rl.models.preference_likelihood import drawn_likelihood, log_likelihood
 from popl_rl.models.schedules import linear_decay
 from popl_rl.models.scoring import case_values, rater_accuracy
-from popl_rl.optim import adam
+from popl_rl.optim import adam, take_step
 
 __all__ = ["LoRe"]
 
@@ -97,9 +97,7 @@ class LoRe:
             margin = self._margins(self._look(pair), pair, weights).flatten()
             slip = self.problem.training.slip
             loss = -drawn_likelihood(margin, said, index, slip).mean()
-            self.optimizer.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]
-            self.optimizer.step()
+            take_step(self.optimizer, loss)
         self.schedule.step()
         self.generation += 1
         share = self.weights().mean(0)
@@ -162,9 +160,7 @@ class LoRe:
         for _ in range(self.settings.fit_steps):
             margin = self._margins(seen, pair, free.softmax(1))
             loss = -(log_likelihood(margin, self.problem.training.slip) * there).sum()
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]
-            optimizer.step()
+            take_step(optimizer, loss)
         # One without answers has no gradient, and stays where it began.
         return free.detach().softmax(1)
 

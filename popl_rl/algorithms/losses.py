@@ -10,6 +10,7 @@ from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.population import Population
 from popl_rl.models.preference_likelihood import drawn_likelihood, log_likelihood
+from popl_rl.optim import take_step
 
 __all__ = ["CPLLoss", "answer_losses", "cloning_weight", "cpl_loss", "descend"]
 
@@ -324,8 +325,6 @@ def descend(
             value = loss(TensorDict(batch, index.shape))["loss_cpl"]
         else:
             value = loss.answers(comparisons, index).mean(1).sum()
-        optimizer.zero_grad(set_to_none=True)
-        value.backward()
-        optimizer.step()
+        take_step(optimizer, value)
         loss.population.constrain_()
     return float(value.detach()) / count

@@ -35,7 +35,7 @@ from popl_rl.models.policies import Spec
 from popl_rl.models.population import Population
 from popl_rl.models.preference_likelihood import log_likelihood
 from popl_rl.models.schedules import linear_decay
-from popl_rl.optim import adam
+from popl_rl.optim import adam, take_step
 from popl_rl.selection.lexicase import lexicase_report
 from popl_rl.selection.mad import mad
 from popl_rl.selection.rules import Selection, report
@@ -203,9 +203,7 @@ class MixturePOPL:
                 index = self._draw(count)
                 losses = self._shared_losses(loss, index)
                 weight = (use[:, None, index] * responsibility[:, index]).flatten(0, 1)
-                optimizer.zero_grad(set_to_none=True)
-                (losses * weight).mean(1).sum().backward()  # type: ignore[no-untyped-call]
-                optimizer.step()
+                take_step(optimizer, (losses * weight).mean(1).sum())
             schedule.step()
         return copies.subset(list(range(settings.folds * size, len(copies))))
 

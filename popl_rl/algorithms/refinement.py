@@ -20,7 +20,7 @@ from popl_rl.config import RefinementSettings
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.population import Population
 from popl_rl.models.preference_likelihood import InParts, per_case
-from popl_rl.optim import adam
+from popl_rl.optim import adam, take_step
 
 __all__ = ["refine", "smallest_subset"]
 
@@ -173,9 +173,7 @@ class _CrossFitting:
             if comparisons.weight is not None:
                 weight = weight * comparisons.weight[index]
             loss = (losses * weight).mean(1).sum()
-            self.optimizer.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]
-            self.optimizer.step()
+            take_step(self.optimizer, loss)
             self.copies.constrain_()
 
     def result(self) -> Population:

@@ -26,7 +26,7 @@ from popl_rl.models.population import Population
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.models.schedules import linear_decay
 from popl_rl.models.scoring import rater_accuracy
-from popl_rl.optim import adam
+from popl_rl.optim import adam, take_step
 from popl_rl.selection.farthest_first import farthest_first
 
 __all__ = ["VPL", "active_units", "divergence", "spread_points", "swap_guidance"]
@@ -163,9 +163,7 @@ class VPL:
         for _ in range(self.problem.block):
             loss, apart, mirrored = self._losses()
             bound = loss + self.kl * apart / self.answers + self.swap * mirrored
-            self.optimizer.zero_grad(set_to_none=True)
-            bound.backward()  # type: ignore[no-untyped-call]
-            self.optimizer.step()
+            take_step(self.optimizer, bound)
         self.schedule.step()
         self.generation += 1
         return {

@@ -7,6 +7,7 @@ ranking under that of Plackett (1975) and Luce (1959).
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
@@ -57,8 +58,15 @@ def _with_slips(right: Tensor, wrong: Tensor, mistake: float) -> Tensor:
         raise ValueError(f"mistake must be in [0, 0.5), got {mistake}")
     if mistake == 0:
         return right
-    chance = right.new_tensor([1 - mistake, mistake]).log()
-    return torch.logaddexp(chance[0] + right, chance[1] + wrong)
+    meant, slipped = _log_chances(mistake, right.dtype)
+    return torch.logaddexp(meant + right, slipped + wrong)
+
+
+@cache
+def _log_chances(mistake: float, dtype: torch.dtype) -> tuple[float, float]:
+    """Logarithms of the chances of what was meant and of a slip, as tensors of a type have them."""
+    meant, slipped = torch.tensor([1 - mistake, mistake], dtype=dtype).log().tolist()
+    return meant, slipped
 
 
 def answer_likelihood(

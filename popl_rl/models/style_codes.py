@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from popl_rl.data.bank import SegmentBank
 from popl_rl.models.policies import PolicySpec, build_network
 from popl_rl.models.schedules import linear_decay
-from popl_rl.optim import adam
+from popl_rl.optim import adam, take_step
 from popl_rl.storage import load_tensordict, read_manifest, save_tensordict
 
 __all__ = ["StyleClone", "load_clone", "save_clone", "train_clone"]
@@ -146,9 +146,7 @@ def train_clone(
         likelihood = spec.step_scores(output, bank.action[segment, cloned]).mean()
         divergence = (centre.square() + log_var.exp() - 1 - log_var).sum(-1).mean() / 2
         loss = beta * divergence - likelihood
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        optimizer.step()
+        take_step(optimizer, loss)
         if done % _BLOCK == 0 or done == steps:
             schedule.step()
             if progress is not None:

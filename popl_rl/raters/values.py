@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.modules import MLP
 
 from popl_rl.keys import OBSERVATION
-from popl_rl.optim import adam
+from popl_rl.optim import adam, take_step
 from popl_rl.raters.groups import RaterGroup
 
 __all__ = ["Value", "fit_value", "with_values"]
@@ -83,9 +83,7 @@ def fit_value(
         for _ in range(steps):
             row = torch.randint(len(flat), (batch_size,), generator=generator)
             loss = (network(inputs[row]).squeeze(-1) - target[row]).square().mean()
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            optimizer.step()
+            take_step(optimizer, loss)
     return value
 
 
