@@ -1,7 +1,6 @@
 """Adam for networks so small that what torch asks at every step takes longer than the step."""
 
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
@@ -18,10 +17,10 @@ def adam(
     betas: tuple[float, float] = (0.9, 0.999),
     eps: float = 1e-8,
 ) -> torch.optim.Adam:
-    """Make ``torch.optim.Adam``, or one whose steps are the same to the bit in less time.
+    """Make ``torch.optim.Adam``, which steps small tensors on the processor all at once.
 
-    The latter is for small tensors of float32 on the processor, which it steps all at once, with a
-    copy of them: a handful in two thirds of the time.
+    That takes six sevenths of the time for a handful of them, with a copy of all, and gives the
+    same bits; torch does so by itself on a GPU only.
 
     Args:
         parameters: What is optimised.
@@ -30,7 +29,7 @@ def adam(
         eps: What is added to the square root of the second moment.
 
     Returns:
-        The optimiser; states of one kind can be loaded into the other.
+        The optimiser.
 
     Example:
         >>> weight = torch.ones(2, requires_grad=True)
@@ -41,8 +40,8 @@ def adam(
         [0.5, 0.5]
     """
     parameters = list(parameters)
-    kind = _TogetherAdam if all(map(_is_small, parameters)) else torch.optim.Adam
-    return kind(parameters, lr=lr, betas=betas, eps=eps)
+    together = True if all(map(_is_small, parameters)) else None
+    return torch.optim.Adam(parameters, lr=lr, betas=betas, eps=eps, foreach=together)
 
 
 def take_step(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
@@ -61,49 +60,4 @@ def take_step(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
 
 
 def _is_small(parameter: Tensor) -> bool:
-    is_simple = parameter.is_cpu and parameter.dtype == torch.float32
-    return is_simple and parameter.numel() <= _SMALL
-
-
-class _TogetherAdam(torch.optim.Adam):
-    """Steps all tensors together, as torch does on a GPU, without asking what they are."""
-
-    def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
-        """Take a step; see ``torch.optim.Adam.step``."""
-        loss = None
-        if closure is not None:
-            with torch.enable_grad():  # type: ignore[no-untyped-call]
-                loss = closure()
-        with torch.no_grad():
-            for group in self.param_groups:
-                self._descend(group)
-        return loss
-
-    def _descend(self, group: dict[str, Any]) -> None:
-        moved = [one for one in group["params"] if one.grad is not None]
-        if not moved:
-            return
-        gradients = [one.grad for one in moved]
-        states = [self.state[one] or self._begun(one) for one in moved]
-        first, second, steps = (
-            [state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step")
-        )
-        (beta1, beta2), rate = group["betas"], float(group["lr"])
-        torch._foreach_add_(steps, 1.0)
-        torch._foreach_lerp_(first, gradients, 1 - beta1)
-        torch._foreach_mul_(second, beta2)
-        torch._foreach_addcmul_(second, gradients, gradients, 1 - beta2)
-        done = [step.item() for step in steps]
-        scale = torch._foreach_sqrt(second)
-        torch._foreach_div_(scale, [(1 - beta2**step) ** 0.5 for step in done])
-        torch._foreach_add_(scale, group["eps"])
-        torch._foreach_addcdiv_(moved, first, scale, [-rate / (1 - beta1**step) for step in done])
-
-    def _begun(self, parameter: Tensor) -> dict[str, Tensor]:
-        state = {
-            "step": torch.tensor(0.0),
-            "exp_avg": torch.zeros_like(parameter, memory_format=torch.preserve_format),
-            "exp_avg_sq": torch.zeros_like(parameter, memory_format=torch.preserve_format),
-        }
-        self.state[parameter] = state
-        return state
+    return parameter.is_cpu and parameter.numel() <= _SMALL

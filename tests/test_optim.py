@@ -44,7 +44,7 @@ def assert_same(optimizers, parameters):
 @pytest.mark.parametrize("options", [{}, {"betas": (0.5, 0.9), "eps": 1e-5}])
 def test_steps_are_those_of_torch_to_the_bit(options):
     optimizers, parameters = pair(**options)
-    assert type(optimizers[1]) is not torch.optim.Adam
+    assert optimizers[1].defaults["foreach"] is True
     schedules = [
         torch.optim.lr_scheduler.LambdaLR(one, lambda epoch: 1 / (1 + epoch)) for one in optimizers
     ]
@@ -65,28 +65,9 @@ def test_states_of_one_are_loaded_into_the_other():
     assert_same(optimizers, parameters)
 
 
-def test_what_is_large_or_not_of_float32_is_left_to_torch():
-    for shape, dtype in (((2**16 + 1,), torch.float32), ((2,), torch.float64)):
-        optimizers, _ = pair(shapes=[shape, (1,)], dtype=dtype)
-        assert type(optimizers[1]) is torch.optim.Adam
-
-
-def test_hooks_and_closures_are_called():
-    (_, ours), (_, [own]) = pair(shapes=[(2,)])
-    called = []
-    ours.register_step_post_hook(lambda *_: called.append("hook"))
-
-    def loss():
-        ours.zero_grad()
-        value = own.square().sum()
-        value.backward()
-        return value.detach()
-
-    before = loss()
-    assert torch.equal(ours.step(loss), before)
-    ours.step()
-    assert called == ["hook", "hook"]
-    assert loss() < before
+def test_what_is_large_is_left_to_torch():
+    optimizers, _ = pair(shapes=[(2**16 + 1,), (1,)])
+    assert optimizers[1].defaults["foreach"] is None
 
 
 def test_a_step_is_one_of_backward_and_leaves_other_gradients_alone():
