@@ -4,6 +4,7 @@ import gc
 
 import pytest
 import torch
+from hydra._internal.hydra import Hydra
 from hydra.core.hydra_config import HydraConfig
 from hypothesis import settings
 
@@ -71,11 +72,26 @@ def pytest_collection_finish():
     gc.enable()
 
 
-@pytest.fixture(autouse=True)
-def no_command_line_left():
+def pytest_runtest_teardown():
     """What one test has typed is not what the next one has."""
-    yield
     HydraConfig.instance().cfg = None
+
+
+@pytest.fixture(autouse=True, scope="session")
+def commands_are_composed_once():
+    """Hydra composes all of a command's settings first to see whether they hold ``hydra.mode``.
+
+    No file of ours sets it. Commands in processes of their own are left as they are.
+    """
+    original = Hydra.get_mode
+
+    def get_mode(self, config_name, overrides):
+        asked = any("hydra.mode" in one for one in overrides)
+        return original(self, config_name, overrides) if asked else None
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Hydra, "get_mode", get_mode)
+        yield
 
 
 @pytest.fixture(scope="session")
