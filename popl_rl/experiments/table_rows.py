@@ -61,15 +61,20 @@ def values_by_seed(rows: pd.DataFrame, over: Over) -> dict[tuple[Entry, str], di
         over: The lowest of the groups, or their mean.
 
     Returns:
-        ``((method, choice), scenario)`` -> seed -> value.
+        ``((method, choice), scenario)`` -> seed -> value. A seed in which the value of a group is
+        unknown, as a recovery is whose oracle is poor, has none: the others would hide it.
     """
     grouped = rows.groupby(["method", "choice", "scenario", "seed"])["value"]
-    each = (grouped.min() if over == "worst" else grouped.mean()).to_dict()
+    each = (grouped.min() if over == "worst" else grouped.mean())[~grouped.agg(_has_unknown)]
     values: dict[tuple[Entry, str], dict[int, float]] = {}
-    for key, value in cast("dict[tuple[str, str, str, int], float]", each).items():
+    for key, value in cast("dict[tuple[str, str, str, int], float]", each.to_dict()).items():
         method, choice, scenario, seed = key
         values.setdefault(((method, choice), scenario), {})[seed] = value
     return values
+
+
+def _has_unknown(values: pd.Series) -> bool:
+    return bool(values.isna().any())
 
 
 def difference(one: dict[int, float], other: dict[int, float]) -> list[float]:

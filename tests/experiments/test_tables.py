@@ -1,3 +1,5 @@
+import math
+
 import pandas as pd
 import pytest
 
@@ -37,6 +39,18 @@ def test_scenarios_may_be_rows():
         "| two groups | 1.00 [1.00] | 0.50 [0.50] |",
         "| three groups | – | – |",
     ]
+
+
+def test_a_group_whose_value_is_unknown_is_not_hidden_by_the_others():
+    rows = [
+        ("s", "two", seed, "popl", "", group, "recovery", value)
+        for seed, *each in [(0, 0.4, 0.9), (1, 0.8, math.nan)]
+        for group, value in zip("ab", each, strict=True)
+    ]
+    for over, shown in (("worst", "0.40"), ("mean", "0.65")):
+        table = ResultTable("s", "recovery", {("popl", ""): "`popl`"}, {"two": "two"}, over)
+        for kept, cell in ((rows, f"{shown} [{shown}]"), (rows[2:], "–")):
+            assert table.markdown(pd.DataFrame(kept, columns=COLUMNS)).endswith(f"| {cell} |")
 
 
 @pytest.mark.parametrize(("value", "shown"), [(-0.004, "0.00"), (-0.5, "−0.50"), (1.0, "1.00")])
