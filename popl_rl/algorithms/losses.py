@@ -127,7 +127,8 @@ class CPLLoss(LossModule):
             loss is ``bc / num_answers``.
 
     Attributes:
-        num_answers: How many answers the members learn from, 1 or ``[N]``; ``descend`` sets it.
+        num_answers: How many answers the members learn from, one number or ``[N]``, which cloning
+            has to know; ``descend`` sets it, None before.
 
     Raises:
         ValueError: If ``alpha`` is not positive, ``bc`` is negative, or ``conservatism`` or
@@ -170,7 +171,7 @@ class CPLLoss(LossModule):
         self.discount = discount
         self.slip = slip
         self.bc = bc
-        self.num_answers: float | Tensor = 1.0
+        self.num_answers: float | Tensor | None = None
         self._features: Tensor | None = None
         self._cells = bank.row
 
@@ -223,7 +224,18 @@ class CPLLoss(LossModule):
 
     @property
     def cloning(self) -> float | Tensor:
-        """The weight of behaviour cloning that ``cpl_loss`` takes."""
+        """The weight of behaviour cloning that ``cpl_loss`` takes.
+
+        Raises:
+            ValueError: If there is some, and nobody has said of how many answers.
+        """
+        if self.bc == 0:
+            return 0.0
+        if self.num_answers is None:
+            raise ValueError(
+                f"num_answers must be set where bc is positive, got None with bc={self.bc}; set it "
+                "to the number of answers that each member learns from, or bc=0"
+            )
         return cloning_weight(self.bc, self.num_answers, alpha=self.alpha, bank=self.bank)
 
     def losses(self, preferred: Tensor, other: Tensor) -> Tensor:

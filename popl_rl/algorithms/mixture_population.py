@@ -199,6 +199,7 @@ class MixturePOPL:
             likelihood = self._likelihood(self.problem.margins(copies))
             belongs = expect(likelihood.unflatten(0, (settings.folds + 1, size)), shares)
             responsibility = belongs.responsibility[fold, :, row].T
+            loss.num_answers = (use.unsqueeze(1) * responsibility).sum(2).flatten()
             for _ in range(_FINAL_BLOCK):
                 index = self._draw(count)
                 losses = self._shared_losses(loss, index)

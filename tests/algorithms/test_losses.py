@@ -79,6 +79,9 @@ def test_cloning_by_hand(hand):
     for alpha in (1.0, 0.5):
         with_bc, without = CPLLoss(*hand, alpha=alpha, bc=3.0), CPLLoss(*hand, alpha=alpha)
         batch = batch_of([[0]], [[1]])
+        with pytest.raises(ValueError, match="num_answers must be set where bc is positive"):
+            with_bc(batch)
+        with_bc.num_answers = 1
         added = with_bc(batch)["loss_cpl"] - without(batch)["loss_cpl"]
         assert float(added.detach()) == pytest.approx(-3.0 * mean, rel=1e-5)
         # Beside 12 answers, what weighs 3 of them has a share of a quarter.

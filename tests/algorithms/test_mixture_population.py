@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 
+from popl_rl.algorithms.losses import CPLLoss
 from popl_rl.algorithms.mixture_population import MixturePOPL
 from popl_rl.algorithms.problem import Problem
 from popl_rl.config import MixtureSettings, Training
@@ -174,6 +175,25 @@ def test_the_result_is_a_mixture_that_acts(bank, comparisons, generator, tmp_pat
     assert set(action.tolist()) <= {0, 1}
     policies.save(tmp_path / "set")
     assert len(PolicySet.load(tmp_path / "set")) == len(policies)
+
+
+def test_cloning_weighs_what_is_asked_beside_what_a_member_speaks_for(
+    bank, comparisons, monkeypatch
+):
+    """Members divide all preferences in each copy; what a fold lacks is made up for."""
+    popl = make(bank, comparisons, recipe={"bc": 2.0})
+    popl.step()
+    known = []
+    losses = CPLLoss.losses
+
+    def watched(self, *arguments):
+        known.append(self.num_answers.clone())
+        return losses(self, *arguments)
+
+    monkeypatch.setattr(CPLLoss, "losses", watched)
+    size = len(popl.result())
+    answers = known[-1].view(SMALL.folds + 1, size).sum(1)
+    torch.testing.assert_close(answers, torch.full((3,), float(len(comparisons))))
 
 
 def test_part_of_a_mixture_can_be_taken(bank, comparisons):
