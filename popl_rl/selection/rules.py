@@ -31,6 +31,9 @@ __all__ = [
 ]
 
 
+_FEW_CASES = 255  # objectives that moocore, which pymoo calls, can sort by
+
+
 class Selection(Protocol):
     """Chooses parents by the values of all members on all cases."""
 
@@ -192,10 +195,13 @@ def fronts_and_crowding(values: Tensor) -> tuple[Tensor, Tensor]:
     """
     _require_pymoo()
     from pymoo.operators.survival.rank_and_crowding.metrics import calc_crowding_distance
+    from pymoo.util.dominator import Dominator
     from pymoo.util.nds.non_dominated_sorting import NonDominatedSorting
 
     costs = -values.double().cpu().numpy()  # pymoo minimises
-    fronts, rank = NonDominatedSorting().do(costs, return_rank=True)
+    # What pymoo calls for speed refuses more cases; with a dominator it compares pairs itself.
+    dominator = Dominator() if costs.shape[1] > _FEW_CASES else None
+    fronts, rank = NonDominatedSorting(dominator=dominator).do(costs, return_rank=True)
     crowding = torch.empty(len(values), dtype=torch.float64)
     for members in fronts:
         crowding[members] = torch.from_numpy(calc_crowding_distance(costs[members]))

@@ -92,6 +92,22 @@ def test_fronts_and_crowding_on_paper():
     assert crowding[:3].tolist() == [torch.inf, 1.0, torch.inf]
 
 
+@pytest.mark.parametrize("cases", [3, 255, 256, 600])
+def test_fronts_of_any_number_of_cases(generator, cases):
+    """Whoever is worse than another nowhere, and better somewhere, is in an earlier front."""
+    best = torch.rand(5, cases, generator=generator).round(decimals=1)
+    values = torch.cat([best, best - 0.5, best - 1.0])
+    front, _ = fronts_and_crowding(values)
+    beats = (values.unsqueeze(1) >= values).all(2) & (values.unsqueeze(1) > values).any(2)
+    expected = torch.full((15,), -1)
+    for number in range(15):
+        left = expected < 0
+        dominated = (beats & left.unsqueeze(1) & left).any(0)
+        expected[left & ~dominated] = number
+    assert front.tolist() == expected.tolist()
+    assert front.max() >= 2
+
+
 def test_nsga2_prefers_the_front_and_then_the_edge(generator):
     """Sixteen ordered pairs: 3 wins only against itself, 1 against itself and 3.
 
