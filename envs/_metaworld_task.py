@@ -1,5 +1,6 @@
 """Metaworld's tasks as Gymnasium environments: repaired, with a state that can be restored."""
 
+import math
 import os
 import sys
 from collections.abc import Callable, Collection, Sequence
@@ -17,8 +18,9 @@ from popl_rl.envs._metaworld_data import check_scripted, collect_continuations
 from popl_rl.envs._metaworld_scripts import Scripted
 from popl_rl.envs._metaworld_simulator import (
     OBSERVATION_SIZE,
+    Simulator,
     SimulatorState,
-    simulator,
+    simulated_task,
     task_name,
 )
 from popl_rl.keys import ACTION
@@ -70,8 +72,8 @@ class MetaworldTask(
     An episode terminates when the task is done or is truncated after ``max_steps``; either way it
     may be carried on.
 
-    All environments of a task in a process share one simulator, so they are cheap to make; they
-    must be used from one thread.
+    All environments of a task in a process share one model, so they are cheap to make; they must be
+    used from one thread.
 
     Each ``info``, at a reset too, holds
 
@@ -138,8 +140,8 @@ class MetaworldTask(
         self.observation_space = gymnasium.spaces.Box(
             -np.inf, np.inf, (OBSERVATION_SIZE,), dtype=np.float32
         )
-        self._shared = simulator(self.task)
-        self._put_aside: SimulatorState | None = None
+        simulated_task(self.task)  # which takes a while the first time
+        self._own: Simulator | None = None
         self._time: int | None = None
         self._renderer: Any = None
 
@@ -148,10 +150,9 @@ class MetaworldTask(
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Start an episode; a seed makes this and the following ones reproducible."""
         super().reset(seed=seed, options=options)
-        self._take_simulator(restore=False)
-        observation = self._shared.reset(self.np_random)
+        observation = self.simulator.reset(self.np_random)
         self._time, self._success = 0, False
-        self._hand, self._velocity = self._shared.hand(), np.zeros(3)
+        self._hand, self._velocity = self.simulator.hand(), np.zeros(3)
         self._thing = observation[4:7].copy()
         return self._answer(observation, False)
 
@@ -168,8 +169,7 @@ class MetaworldTask(
         action = np.asarray(action, dtype=np.float32)
         if action.shape != (4,) or not np.isfinite(action).all():
             raise ValueError(f"action must be 4 finite numbers in [-1, 1], got {action}.")
-        self._take_simulator()
-        observation, reward, success = self._shared.step(action)
+        observation, reward, success = self.simulator.step(action)
         self._time = time + 1
         seen, info = self._answer(observation, success)
         terminated = self.terminate and self._success
@@ -182,9 +182,8 @@ class MetaworldTask(
             RuntimeError: If there was no reset.
         """
         time = self._steps_taken("get_state")
-        self._take_simulator()
         return TaskState(
-            self._shared.get_state(),
+            self.simulator.get_state(),
             time,
             self._success,
             self._hand,
@@ -197,8 +196,7 @@ class MetaworldTask(
 
     def set_state(self, state: TaskState) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Go on from a state of the same task, to the bit; return its observation and info."""
-        self._take_simulator(restore=False)
-        self._shared.set_state(state.simulator)
+        self.simulator.set_state(state.simulator)
         self._time, self._success = state.time, state.success
         self._remaining = state.remaining
         self._hand, self._velocity, self._thing = state.hand, state.velocity, state.thing
@@ -308,8 +306,8 @@ class MetaworldTask(
             RuntimeError: If there was no reset, or this machine has no renderer that works.
         """
         self._steps_taken("render")
-        self._take_simulator()
-        sim = self._shared.env
+        self.simulator.take_model()
+        sim = self.simulator.env
         if self._renderer is None:
             self._renderer = _make_renderer(sim.model, self.size)
         self._renderer.update_scene(sim.data, camera=self.camera)
@@ -329,26 +327,21 @@ class MetaworldTask(
             raise RuntimeError(f"call reset() before {asked}().")
         return self._time
 
-    def _take_simulator(self, *, restore: bool = True) -> None:
-        """Have the simulator in this environment's state, and keep the other's for it."""
-        if self._shared.owned_by(self):
-            return
-        other = self._shared.owner()
-        if other is not None:
-            other._put_aside = self._shared.get_state()
-        self._shared.give_to(self)
-        if restore and self._put_aside is not None:
-            self._shared.set_state(self._put_aside)
-        self._put_aside = None
+    @property
+    def simulator(self) -> Simulator:
+        """The simulator, which is made where it is needed first."""
+        if self._own is None:
+            self._own = Simulator(self.task)
+        return self._own
 
     def _answer(
         self, observation: NDArray[np.float64], success: bool
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Return observation and info, comparing with the step before."""
-        hand, thing, goal = self._shared.hand(), observation[4:7].copy(), observation[36:]
+        hand, thing, goal = self.simulator.hand(), observation[4:7].copy(), observation[36:]
         self._success = self._success or success
-        to_target = np.linalg.norm(thing - goal)
-        reach = np.linalg.norm(self._shared.tip() - thing)
+        to_target = _length(thing - goal)
+        reach = _length(self.simulator.tip() - thing)
         remaining = 0.0 if self._success else float(reach + to_target)
         closed = self._remaining - remaining if self._time else 0.0
         velocity = (hand - self._hand) / STEP_SECONDS
@@ -356,12 +349,10 @@ class MetaworldTask(
         self._info = {
             "success": np.int64(self._success),
             "time": np.int64(self._time or 0),
-            "hand_speed": np.float32(np.linalg.norm(velocity)),
-            "hand_acceleration": np.float32(
-                np.linalg.norm(velocity - self._velocity) / STEP_SECONDS
-            ),
-            "contact_force": np.float32(self._shared.contact_force()),
-            "object_speed": np.float32(np.linalg.norm(thing - self._thing) / STEP_SECONDS),
+            "hand_speed": np.float32(_length(velocity)),
+            "hand_acceleration": np.float32(_length(velocity - self._velocity) / STEP_SECONDS),
+            "contact_force": np.float32(self.simulator.contact_force()),
+            "object_speed": np.float32(_length(thing - self._thing) / STEP_SECONDS),
             "obj_to_target": np.float32(to_target),
             "remaining": np.float32(remaining),
             "closed": np.float32(closed),
@@ -370,6 +361,11 @@ class MetaworldTask(
         self._remaining = remaining
         self._observation = observation.astype(np.float32)
         return self._observation.copy(), dict(self._info)
+
+
+def _length(vector: NDArray[np.float64]) -> float:
+    """As ``numpy.linalg.norm`` has it to the bit, which asks longer than it reckons."""
+    return math.sqrt(vector.dot(vector))
 
 
 def _make_renderer(model: Any, size: int) -> Any:

@@ -23,6 +23,7 @@ from torch import Tensor
 from popl_rl.data.rollouts import MASK, lockstep
 from popl_rl.data.table_rollouts import Rollouts
 from popl_rl.envs.goal_grid import goal_grid
+from popl_rl.envs.metaworld_tasks import MetaworldTask
 from popl_rl.envs.two_doors import two_doors
 from popl_rl.evaluation.optimum import action_probabilities
 from popl_rl.keys import INFO, OBSERVATION
@@ -138,6 +139,42 @@ def test_lockstep(
     for env in envs:
         env.close()
     assert ratio > least
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_tasks_of_metaworld(race: Any) -> None:
+    """Our environments of a task, which measure more, beside Metaworld's own."""
+    count, episodes, max_steps = 8, 4, 100
+    envs = [MetaworldTask("drawer-open", terminate=False) for _ in range(count * episodes)]
+    theirs = [drawer() for _ in envs]
+    spec = PolicySpec.from_env(envs[0], hidden=(256, 256))
+    draws = torch.Generator().manual_seed(0)
+    policies = PolicySet(Population.create(spec, count, generator=draws))
+    seeds = torch.randint(2**31, (episodes,), generator=draws).tolist() * count
+
+    def roll() -> TensorDictBase:
+        generator = torch.Generator().manual_seed(1)
+
+        def act(step: TensorDictBase) -> Tensor:
+            observation = step[OBSERVATION].view(count, episodes, -1)
+            return policies.act(observation, generator=generator).flatten(0, 1)
+
+        return lockstep(envs, act, seeds=seeds, max_steps=max_steps)
+
+    rolled = roll()
+    steps = int(rolled[MASK].sum())
+    actions = [row["action"][row[MASK]].numpy() for row in rolled.unbind(0)]
+    ratio = race(
+        f"{count} policies x {episodes} episodes of drawer-open as our task, {steps} steps",
+        roll,
+        lambda: bare(theirs, seeds, actions),
+        reference="bare env.step of Metaworld's",
+        target=0.9,
+        rounds=7,
+    )
+    for env in [*envs, *theirs]:
+        env.close()
+    assert ratio > 0.6
 
 
 @pytest.mark.parametrize(

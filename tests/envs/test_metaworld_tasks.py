@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from popl_rl.envs._metaworld_scripts import Scripted
-from popl_rl.envs._metaworld_simulator import simulator, task_name
+from popl_rl.envs._metaworld_simulator import task_name
 from popl_rl.envs.metaworld_tasks import (
     STEP_SECONDS,
     MetaworldTask,
@@ -78,6 +78,33 @@ def test_seeds_make_episodes(task):
     assert not np.array_equal(env.reset()[0], env.reset()[0])
 
 
+@pytest.mark.parametrize("task", ["drawer-open", "door-lock", "assembly", "basketball"])
+def test_taking_turns_changes_no_bit(task):
+    """Tasks move bodies of the model, which all share, and keep views of MuJoCo's memory."""
+    envs, alone = [metaworld(task) for _ in range(3)], metaworld(task)
+    begins = [env.reset(seed=seed)[0] for seed, env in enumerate(envs)]
+    in_turn = [[env.step(action) for env in envs] for action in draw_actions(12)]
+    for seed, steps in enumerate(zip(*in_turn, strict=True)):
+        assert np.array_equal(alone.reset(seed=seed)[0], begins[seed])
+        assert same(play(alone, draw_actions(12)), steps)
+    never_reset = metaworld(task)
+    never_reset.set_state(envs[1].get_state())
+    assert same(play(never_reset, draw_actions(5, seed=1)), play(envs[1], draw_actions(5, seed=1)))
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_observations_are_put_together_as_metaworld_does(task):
+    env = metaworld(task)
+    env.reset(seed=0)
+    for action in draw_actions(5):
+        env.step(action)
+        own = env.unwrapped.simulator.env
+        assert np.array_equal(
+            own._get_curr_obs_combined_no_goal(),
+            super(type(own), own)._get_curr_obs_combined_no_goal(),
+        )
+
+
 @pytest.mark.parametrize("task", ["door-open", "bin-picking"])
 def test_a_restored_state_goes_on_to_the_bit(task):
     env = metaworld(task)
@@ -124,7 +151,7 @@ def test_speeds_are_displacements_over_time():
     remaining = [info["remaining"], *(step[4]["remaining"] for step in steps)]
     closed = [step[4]["closed"] for step in steps]
     assert np.allclose(closed, -np.diff(remaining), atol=1e-6)
-    simulated = simulator(env.unwrapped.task).env
+    simulated = env.unwrapped.simulator.env
     assert simulated.model.opt.timestep * simulated.frame_skip == pytest.approx(STEP_SECONDS)
 
 
@@ -148,7 +175,7 @@ def test_episodes_end_when_done_or_out_of_time():
 def test_steps_go_on_beyond_metaworlds_horizon():
     env = metaworld(max_steps=1000)
     env.reset(seed=0)
-    simulator(env.unwrapped.task).env.curr_path_length = 499
+    env.unwrapped.simulator.env.curr_path_length = 499
     assert [step[3] for step in play(env, draw_actions(3))] == [False] * 3
 
 
