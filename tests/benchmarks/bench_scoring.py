@@ -13,11 +13,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from popl_rl.algorithms.losses import CPLLoss, descend
 from popl_rl.data.bank import SegmentBank
+from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.population import Population
 from popl_rl.models.reward_functions import RewardSpec
 from popl_rl.models.scoring import segment_scores
+from popl_rl.optim import adam
 
 pytestmark = [pytest.mark.benchmark, pytest.mark.timeout(1800)]
 
@@ -67,6 +70,33 @@ def test_whole_networks(race: Any, shape: tuple[int, int, int]) -> None:
         rounds=9,
     )
     assert ratio > 0.5  # the target, less what a loaded machine may take off
+
+
+def test_training_steps(race: Any) -> None:
+    """CPL steps of a stacked population; gradients take twice the products of scores."""
+    members, batch = 16, 32
+    population, bank = whole_population(members), continuous_bank(256)
+    answers = torch.randint(256, (2, 4000), generator=torch.Generator().manual_seed(2))
+    comparisons = Comparisons(*answers, torch.arange(4000) % 100, 100)
+    loss = CPLLoss(population, bank, slip=0.05)
+    optimizer = adam(population.members.parameters(), lr=1e-3)
+    generator = torch.Generator().manual_seed(3)
+    rows = members * batch * 2 * STEPS
+    # Of the observations themselves no gradient is taken.
+    work = rows * (2 * 39 * 256 + 3 * (256 * 256 + 256 * 4))
+    number = round(work / 2048**3)
+    ratio = race(
+        f"a CPL step of {members} members 39-256-256-4 on {batch} pairs each x 2 x 64 steps",
+        lambda: descend(
+            loss, optimizer, comparisons, steps=1, batch_size=batch, generator=generator
+        ),
+        products(2048, 2048, 2048, number),
+        reference=f"{number} times mm 2048 x 2048 x 2048",
+        scale=work / (number * 2048**3),
+        target=0.7,
+        rounds=9,
+    )
+    assert ratio > 0.4
 
 
 def test_whole_networks_on_all_pairs(race: Any, extra_memory: Any) -> None:
