@@ -44,9 +44,7 @@ def texts(fig):
 
 
 def assert_nothing_overlaps_the_edge(fig):
-    layout = fig.get_layout_engine()
-    assert layout is not None
-    layout.execute(fig)
+    fig.draw_without_rendering()
     box = fig.get_tightbbox()
     assert box.x0 > -0.02
     assert box.y0 > -0.02

@@ -37,9 +37,7 @@ def ylabelled(fig: Figure, start: str) -> Axes:
 
 
 def assert_nothing_overlaps_the_edge(fig: Figure) -> None:
-    layout = fig.get_layout_engine()
-    assert layout is not None
-    layout.execute(fig)
+    fig.draw_without_rendering()
     box = fig.get_tightbbox()
     assert box.x0 > -0.02
     assert box.y0 > -0.02
