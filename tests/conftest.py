@@ -48,6 +48,7 @@ TINY = [
     "data.segments=200",
     "data.length=6",
     "raters.count=8",
+    "method.training.bc=1",  # beside a few dozen answers 40 would be nearly all
     "raters.answers=10",
     "evaluation.episodes=40",
     "evaluation.new_raters=2",

@@ -134,7 +134,9 @@ def test_likelihoods_and_losses_are_those_of_the_processor(build, device):
     population = method.population
     likelihood = problem.likelihood(problem.scores(population))
     index = torch.arange(20, device=device)
-    losses = problem.loss(population).answers(problem.comparisons, index)
+    # The likelihood knows no prior.
+    loss = problem.loss(population, cloning=False)
+    losses = loss.answers(problem.comparisons, index)
     assert likelihood.device.type == losses.device.type == device
     torch.testing.assert_close(losses.mean(1), -likelihood[:, :20].mean(1), rtol=1e-3, atol=1e-4)
 
