@@ -34,7 +34,7 @@ class Address:
 
 
 def listen(host: str, port: int) -> Address:
-    """Bind to an address.
+    """Take an address: who comes before pages are served waits, and is not refused.
 
     Args:
         host: Name or number of the address.
@@ -51,6 +51,7 @@ def listen(host: str, port: int) -> Address:
         try:
             bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             bound.bind(where)
+            bound.listen()
         except OSError:
             bound.close()
             raise

@@ -1,4 +1,5 @@
 import importlib.util
+import socket
 import threading
 import time
 
@@ -63,3 +64,10 @@ def test_work_is_done_regularly_and_at_the_end():
         within = len(times)
     assert 2 <= within <= 4
     assert len(times) == within + 1
+
+
+def test_who_comes_before_the_server_waits():
+    """An address may be told as soon as it is taken, however long the server takes to start."""
+    address = listen("127.0.0.1", 0)
+    with address.socket, socket.create_connection(address.socket.getsockname(), timeout=5):
+        pass
