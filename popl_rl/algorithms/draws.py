@@ -64,16 +64,15 @@ def by_comparison(comparisons: Comparisons, weight: Tensor, *, least: float = _L
         least: What is added to every weight; if 0, each row needs a positive one.
     """
     weight = comparisons.weighted(weight + least)
-    answers = weight.sum(1)
     if len(comparisons) <= _FEW:
         return Draws(
             lambda batch_size, generator: torch.multinomial(
                 weight, batch_size, replacement=True, generator=generator
             ),
-            answers,
+            weight.sum(1),
         )
     total = weight.cumsum(1, dtype=torch.float64)
-    return Draws(lambda batch_size, generator: _draw(total, batch_size, generator), answers)
+    return Draws(lambda batch_size, generator: _draw(total, batch_size, generator), total[:, -1])
 
 
 def by_case(comparisons: Comparisons, weight: Tensor, *, least: float = _LEAST) -> Draws:

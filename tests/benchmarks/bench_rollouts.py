@@ -9,7 +9,7 @@ per second that remains with the policies asked and everything recorded.
 
 import importlib
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium
@@ -90,6 +90,27 @@ def bare(
             env.step(action)
 
 
+def rollouts(
+    envs: list[Any], count: int, *, hidden: tuple[int, ...], max_steps: int
+) -> tuple[Callable[[], TensorDictBase], list[int], list[Any]]:
+    """Episodes of ``count`` policies in lockstep, their seeds, and the actions that they took."""
+    spec, episodes = PolicySpec.from_env(envs[0], hidden=hidden), len(envs) // count
+    draws = torch.Generator().manual_seed(0)
+    policies = PolicySet(Population.create(spec, count, generator=draws))
+    seeds = torch.randint(2**31, (episodes,), generator=draws).tolist() * count
+
+    def roll() -> TensorDictBase:
+        generator = torch.Generator().manual_seed(1)
+
+        def act(step: TensorDictBase) -> Tensor:
+            observation = step[OBSERVATION].view(count, episodes, -1)
+            return policies.act(observation, generator=generator).flatten(0, 1)
+
+        return lockstep(envs, act, seeds=seeds, max_steps=max_steps)
+
+    return roll, seeds, [row["action"][row[MASK]].numpy() for row in roll().unbind(0)]
+
+
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
     ("name", "count", "episodes", "max_steps", "hidden", "least"),
@@ -111,23 +132,8 @@ def test_lockstep(
     least: float,
 ) -> None:
     envs = [MAKERS[name]() for _ in range(count * episodes)]
-    spec = PolicySpec.from_env(envs[0], hidden=hidden)
-    draws = torch.Generator().manual_seed(0)
-    policies = PolicySet(Population.create(spec, count, generator=draws))
-    seeds = torch.randint(2**31, (episodes,), generator=draws).tolist() * count
-
-    def roll() -> TensorDictBase:
-        generator = torch.Generator().manual_seed(1)
-
-        def act(step: TensorDictBase) -> Tensor:
-            observation = step[OBSERVATION].view(count, episodes, -1)
-            return policies.act(observation, generator=generator).flatten(0, 1)
-
-        return lockstep(envs, act, seeds=seeds, max_steps=max_steps)
-
-    rolled = roll()
-    steps = int(rolled[MASK].sum())
-    actions = [row["action"][row[MASK]].numpy() for row in rolled.unbind(0)]
+    roll, seeds, actions = rollouts(envs, count, hidden=hidden, max_steps=max_steps)
+    steps = sum(map(len, actions))
     ratio = race(
         f"{count} policies x {episodes} episodes of {name}, {steps} steps",
         roll,
@@ -147,23 +153,8 @@ def test_tasks_of_metaworld(race: Any) -> None:
     count, episodes, max_steps = 8, 4, 100
     envs = [MetaworldTask("drawer-open", terminate=False) for _ in range(count * episodes)]
     theirs = [drawer() for _ in envs]
-    spec = PolicySpec.from_env(envs[0], hidden=(256, 256))
-    draws = torch.Generator().manual_seed(0)
-    policies = PolicySet(Population.create(spec, count, generator=draws))
-    seeds = torch.randint(2**31, (episodes,), generator=draws).tolist() * count
-
-    def roll() -> TensorDictBase:
-        generator = torch.Generator().manual_seed(1)
-
-        def act(step: TensorDictBase) -> Tensor:
-            observation = step[OBSERVATION].view(count, episodes, -1)
-            return policies.act(observation, generator=generator).flatten(0, 1)
-
-        return lockstep(envs, act, seeds=seeds, max_steps=max_steps)
-
-    rolled = roll()
-    steps = int(rolled[MASK].sum())
-    actions = [row["action"][row[MASK]].numpy() for row in rolled.unbind(0)]
+    roll, seeds, actions = rollouts(envs, count, hidden=(256, 256), max_steps=max_steps)
+    steps = sum(map(len, actions))
     ratio = race(
         f"{count} policies x {episodes} episodes of drawer-open as our task, {steps} steps",
         roll,
