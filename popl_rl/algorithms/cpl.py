@@ -56,8 +56,8 @@ class GroupCPL(MultiCPL):
         super().__init__(problem, population=population, generator=generator)
         self.draws = by_comparison(problem.comparisons, weight.to(problem.device))
 
-    def _draws(self, scores: Tensor) -> tuple[Draws, dict[str, float]]:  # noqa: ARG002
-        return self.draws, {}
+    def _unscored_draws(self) -> Draws | None:
+        return self.draws
 
     def result(self) -> HypothesisSet:
         """The K hypotheses, in the order of the weights."""
@@ -71,8 +71,9 @@ def train(method: Method, *, progress: Callable[[int], None] | None = None) -> H
         method: What to run, from wherever it is.
         progress: Called with the number of generations done.
     """
+    step = method.step_unwatched if isinstance(method, MultiCPL) else method.step
     while method.generation < method.generations:
-        method.step()
+        step()
         if progress is not None:
             progress(method.generation)
     return method.result()

@@ -114,7 +114,7 @@ def merge(chance: Tensor, share: Tensor) -> list[Tensor]:
 def responsibility(problem: Problem, population: Population, share: Tensor) -> Tensor:
     """E-step: how much each member serves each rater, ``[N, C]``; 0 for raters without answers."""
     comparisons = problem.comparisons
-    likelihood = per_case(problem.likelihood(problem.scores(population)), comparisons)
+    likelihood = per_case(problem.likelihood(problem.compared_scores(population)), comparisons)
     asked = comparisons.sizes() > 0
     return expect(likelihood, share).responsibility * asked
 

@@ -62,6 +62,9 @@ class EM(MultiCPL):
         }
         return by_case(self.problem.comparisons, belongs.flatten(0, 1)), about
 
+    def _unscored_draws(self) -> Draws | None:
+        return None
+
     def _expect(self, scores: Tensor) -> Expectation:
         """Responsibilities ``[R, K, C]`` and evidence ``[R, C]`` of every mixture."""
         likelihood = per_case(self.problem.likelihood(scores), self.problem.comparisons)
@@ -69,7 +72,7 @@ class EM(MultiCPL):
 
     def likelihood(self) -> Tensor:
         """Mean log-likelihood of a case under each mixture as it is now, ``[R]``."""
-        return self._expect(self.problem.scores(self.population)).evidence.mean(1)
+        return self._expect(self.problem.compared_scores(self.population)).evidence.mean(1)
 
     def result(self) -> HypothesisSet:
         """The components of the likeliest mixture, their scale fitted for catering."""

@@ -56,24 +56,45 @@ class MultiCPL:
             Scalars to log: ``worst_rater_accuracy`` (10 % quantile over cases of the best member's
             accuracy) and ``mean_accuracy``, both as the generation found them, and ``loss_cpl``.
         """
-        scores, comparisons = self.problem.scores(self.population), self.problem.comparisons
-        passed = pass_shares(scores, comparisons)
+        scores = self.problem.compared_scores(self.population)
+        passed = pass_shares(scores, self.problem.comparisons)
         draws, about = self._draws(scores)
-        # Everybody is the one child of itself.
-        itself = torch.arange(len(self.population), device=scores.device)
-        trained = self.training.descend(itself, draws)
-        self.generation += 1
         return {
             "worst_rater_accuracy": rater_accuracy(passed.values),
             "mean_accuracy": passed.mean,
             **about,
-            **trained,
+            **self._train(draws),
         }
 
-    def _draws(self, scores: Tensor) -> tuple[Draws, dict[str, float]]:
+    def step_unwatched(self) -> None:
+        """Run one generation of which nobody wants to know how it goes.
+
+        Hypotheses end as after ``step``. To score them takes longer than to train a few.
+        """
+        draws = self._unscored_draws()
+        if draws is None:
+            self.step()
+        else:
+            self._train(draws)
+
+    def _train(self, draws: Draws) -> dict[str, float]:
+        # Everybody is the one child of itself.
+        itself = torch.arange(len(self.population), device=self.problem.device)
+        trained = self.training.descend(itself, draws)
+        self.generation += 1
+        return trained
+
+    def _draws(self, scores: Tensor) -> tuple[Draws, dict[str, float]]:  # noqa: ARG002
         """How often each member draws each comparison, and scalars to log."""
+        draws = self._unscored_draws()
+        assert draws is not None
+        return draws, {}
+
+    def _unscored_draws(self) -> Draws | None:
+        """How often each member draws each comparison; None where scores decide."""
         comparisons = self.problem.comparisons
-        return by_case(comparisons, scores.new_ones(len(scores), comparisons.num_cases)), {}
+        weight = torch.ones(len(self.population), comparisons.num_cases, device=self.problem.device)
+        return by_case(comparisons, weight)
 
     def result(self) -> HypothesisSet:
         """One member for each distinct behaviour, its scale fitted for catering."""

@@ -86,7 +86,7 @@ class NicheSearch:
     def step(self) -> float:
         """E-step and gradient steps of one generation; returns the loss."""
         problem, comparisons = self.problem, self.problem.comparisons
-        likelihood = per_case(problem.likelihood(problem.scores(self.stack)), comparisons)
+        likelihood = per_case(problem.likelihood(problem.compared_scores(self.stack)), comparisons)
         parts = [expect(likelihood[part], self.share[part]) for part in self._parts()]
         served = torch.cat([part.responsibility for part in parts])
         self.share = served[:, self.raters].mean(1)

@@ -1,7 +1,7 @@
 """What every method is given, and what every method is: ``Problem`` and ``Method``."""
 
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Literal, Protocol
 
 import torch
@@ -104,13 +104,27 @@ class Problem:
             population, self.bank, alpha=self.training.alpha, discount=self.training.discount
         )
 
+    def compared_scores(self, population: Population) -> Tensor:
+        """As ``scores``, of segments that comparisons are about; others may be NaN."""
+        return segment_scores(
+            population,
+            self.bank,
+            alpha=self.training.alpha,
+            discount=self.training.discount,
+            wanted=self._compared,
+        )
+
+    @cached_property
+    def _compared(self) -> Tensor:
+        return self.comparisons.segments(len(self.bank))
+
     def margins(self, population: Population) -> Tensor:
         """Margins ``S(sigma+) - S(sigma-)`` of every member on every comparison, ``[N, M]``."""
-        return margins_of(self.scores(population), self.comparisons)
+        return margins_of(self.compared_scores(population), self.comparisons)
 
     def pass_shares(self, population: Population) -> PassShares:
         """Which share of each case's comparisons each member passes."""
-        return pass_shares(self.scores(population), self.comparisons)
+        return pass_shares(self.compared_scores(population), self.comparisons)
 
     def likelihood(self, scores: Tensor) -> Tensor:
         """Log-likelihood of every answer, the one that every method here maximises.
@@ -120,7 +134,7 @@ class Problem:
         the CPL loss with the opposite sign, so that E-steps and gradient steps agree.
 
         Args:
-            scores: As of ``scores``, ``[N, segments]``.
+            scores: As of ``compared_scores``, ``[N, segments]``.
 
         Returns:
             ``[N, M]``.
@@ -144,7 +158,11 @@ class Problem:
     def calibrated(self, found: HypothesisSet) -> HypothesisSet:
         """The same set with scores of the scale under which catering predicts answers best."""
         scores = segment_scores(
-            found.population, self.bank, alpha=found.alpha, discount=found.discount
+            found.population,
+            self.bank,
+            alpha=found.alpha,
+            discount=found.discount,
+            wanted=self._compared,
         )
         margin = InParts(len(found), partial(margins_of, scores, self.comparisons))
         found.alpha *= fit_scale(margin, self.comparisons)

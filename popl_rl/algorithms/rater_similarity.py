@@ -105,7 +105,13 @@ def seed_with_specialists(
         learning_rate=learning_rate,
         generator=generator,
     )
-    scores = segment_scores(found, loss.bank, alpha=loss.alpha, discount=loss.discount)
+    scores = segment_scores(
+        found,
+        loss.bank,
+        alpha=loss.alpha,
+        discount=loss.discount,
+        wanted=comparisons.segments(len(loss.bank)),
+    )
     values = pass_shares(scores, comparisons).values
     chosen = lexicase_selection(values, len(population), epsilon=mad(values), generator=generator)
     population.members.data.update_(found.members.data[chosen].clone())

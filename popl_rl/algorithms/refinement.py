@@ -124,7 +124,7 @@ class _CrossFitting:
 
     def _likelihood(self, population: Population) -> InParts:
         """Log-likelihood of every comparison under every member, ``[N, M]``."""
-        return self.problem.likelihood_in_parts(self.problem.scores(population))
+        return self.problem.likelihood_in_parts(self.problem.compared_scores(population))
 
     def _by_copy(self, value: Tensor) -> Tensor:
         """Values of members ``[N, ...]`` by copy and member."""

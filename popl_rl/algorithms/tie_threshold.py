@@ -36,7 +36,7 @@ def with_threshold(
     pooled = MultiCPL(short, population=population, generator=generator)
     while pooled.generation < pooled.generations:
         pooled.step()
-        scores = pooled.problem.scores(population)[0]
+        scores = pooled.problem.compared_scores(population)[0]
         said = problem.comparisons
         margin = scores[said.preferred] - pooled.problem.conservatism * scores[said.other]
         pooled.problem = _with(short, fit_threshold(margin, said, problem.training.slip))

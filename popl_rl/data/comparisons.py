@@ -135,6 +135,13 @@ class Comparisons:
         rows = self.stages[self.stage[index]]
         return torch.where(rows < 0, index.unsqueeze(-1), rows).flatten(-2)
 
+    def segments(self, total: int) -> Tensor:
+        """Which of ``total`` segments some comparison is about, ascending."""
+        is_used = torch.zeros(total, dtype=torch.bool, device=self.preferred.device)
+        is_used[self.preferred] = True
+        is_used[self.other] = True
+        return is_used.nonzero()[:, 0]
+
     def blocks(self, size: int) -> Iterator[slice]:
         """Slices of at most ``size`` comparisons, all of them one after the other."""
         for start in range(0, len(self), size):

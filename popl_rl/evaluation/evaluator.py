@@ -118,10 +118,11 @@ class Evaluator:
         self._policies = acting.policies if isinstance(acting, Rolling) else None
 
     def scores(self, hypotheses: HypothesisSet) -> Tensor:
-        """Score of every segment in every hypothesis's eyes, ``[P, N]``."""
-        return segment_scores(
-            hypotheses.population, self.bank, alpha=hypotheses.alpha, discount=hypotheses.discount
-        ).cpu()
+        """Scores of all segments, ``[P, N]``; those that nobody is asked about may be NaN."""
+        how: dict[str, Any] = {"alpha": hypotheses.alpha, "discount": hypotheses.discount}
+        if self.pool is not None and self.pool.allowed is not None:
+            how["wanted"] = self.pool.allowed
+        return segment_scores(hypotheses.population, self.bank, **how).cpu()
 
     def accuracy(self, hypotheses: HypothesisSet) -> Tensor:
         """Accuracy of every hypothesis on every group's held-out pairs, ``[P, G]``."""

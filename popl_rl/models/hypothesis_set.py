@@ -126,13 +126,13 @@ class HypothesisSet:
         """Scores of segments ``[N, segments]``, and the comparisons by their numbers in these."""
         bank = segments if isinstance(segments, SegmentBank) else self._bank(segments)
         pair = torch.stack([comparisons.preferred, comparisons.other])
-        if pair.numel() < len(bank):
-            # A few answers are about a few segments: score no others.
+        device = self.population.device
+        how: dict[str, Any] = {"alpha": self.alpha, "discount": self.discount}
+        if pair.numel() < len(bank):  # a few answers are about a few segments
             used, pair = pair.unique(return_inverse=True)
             bank = bank.subset(used)
             comparisons = replace(comparisons, preferred=pair[0], other=pair[1])
-        device = self.population.device
-        how: dict[str, Any] = {"alpha": self.alpha, "discount": self.discount}
+        how["wanted"] = comparisons.segments(len(bank))
         return segment_scores(self.population, bank.to(device), **how), comparisons.to(device)
 
     def cater(

@@ -6,12 +6,20 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 from torch import Tensor, nn
 
-__all__ = ["Layer", "activation", "apply_layers", "change_layers", "some_layers"]
+__all__ = [
+    "Layer",
+    "activation",
+    "apply_layers",
+    "apply_shared",
+    "change_layers",
+    "some_layers",
+]
 
 
 #: Weight and bias of a linear layer, or what comes between two of them. Weights are ``[N, K, F]``,
-#: or ``[K, F]`` where all members share one; biases ``[N, K]``, or ``[K]`` likewise.
-Layer = tuple[Tensor, Tensor | None] | nn.Module
+#: or ``[K, F]`` where all members share one; biases ``[N, K]``, or ``[K]`` likewise. Without a
+#: weight the bias is added to what is there.
+Layer = tuple[Tensor | None, Tensor | None] | nn.Module
 
 
 def activation(layer: nn.Module) -> nn.Module | None:
@@ -30,6 +38,9 @@ def apply_layers(layers: Sequence[Layer], features: Tensor) -> Tensor:
             hidden = layer(hidden)
             continue
         weight, bias = layer
+        if weight is None:
+            hidden = hidden if bias is None else hidden + bias.unsqueeze(-2)
+            continue
         if weight.ndim == 2:
             if bias is None or bias.ndim == 1:
                 hidden = F.linear(hidden, weight, bias)
@@ -54,6 +65,23 @@ def apply_layers(layers: Sequence[Layer], features: Tensor) -> Tensor:
     return hidden
 
 
+def apply_shared(layers: Sequence[Layer], features: Tensor) -> tuple[list[Layer], Tensor]:
+    """Do once for all members what they share of the first layer.
+
+    Args:
+        layers: Own layers of N members.
+        features: What these are applied to, ``[R, F]``.
+
+    Returns:
+        What is left to do, and what to do it to: the layers and features themselves where the first
+        layer is not shared.
+    """
+    first = layers[0]
+    if isinstance(first, nn.Module) or first[0] is None or first[0].ndim != 2:
+        return list(layers), features
+    return [(None, first[1]), *layers[1:]], F.linear(features, first[0])
+
+
 def change_layers(layers: Sequence[Layer], change: Callable[[Tensor], Tensor]) -> list[Layer]:
     """The same layers with other weights and biases."""
     changed: list[Layer] = []
@@ -62,7 +90,12 @@ def change_layers(layers: Sequence[Layer], change: Callable[[Tensor], Tensor]) -
             changed.append(layer)
         else:
             weight, bias = layer
-            changed.append((change(weight), None if bias is None else change(bias)))
+            changed.append(
+                (
+                    None if weight is None else change(weight),
+                    None if bias is None else change(bias),
+                )
+            )
     return changed
 
 
@@ -74,6 +107,6 @@ def some_layers(layers: Sequence[Layer], part: slice) -> list[Layer]:
             chosen.append(layer)
         else:
             weight, bias = layer
-            own = weight[part] if weight.ndim == 3 else weight
+            own = weight[part] if weight is not None and weight.ndim == 3 else weight
             chosen.append((own, bias[part] if bias is not None and bias.ndim == 2 else bias))
     return chosen

@@ -114,6 +114,14 @@ class Population(nn.Module):
             layers.append((layer["weight"], layer.get("bias", None)))
         return layers
 
+    def without_repeats(self) -> tuple["Population", Tensor | None]:
+        """Members that are known to differ, and which of these each member is, ``[N]``.
+
+        The population itself and None where there are none that are known to be equal, as among
+        whole networks, which nobody compares.
+        """
+        return self, None
+
     def constrain_(self) -> None:
         """Put members that a step led out of bounds back, in place; whole networks have none."""
 

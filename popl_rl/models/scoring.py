@@ -10,7 +10,7 @@ from torch import Tensor
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.convolutions import Patches
-from popl_rl.models.layers import apply_layers, change_layers, some_layers
+from popl_rl.models.layers import apply_layers, apply_shared, change_layers, some_layers
 from popl_rl.models.population import Population
 from popl_rl.models.reward_functions import RewardSpec
 
@@ -54,6 +54,7 @@ def segment_scores(
     *,
     alpha: float = 1.0,
     discount: float = 1.0,
+    wanted: Tensor | None = None,
     memory_mb: float = 256.0,
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
@@ -65,13 +66,16 @@ def segment_scores(
     Observations that occur more than once in the bank are looked at once where actions are
     discrete, and by reward functions. What a frozen trunk makes of the bank is kept for the next
     call as long as it takes at most half of ``memory_mb``, else worked out again in chunks. Heads
-    of reward functions are linear: they score a segment by the sum of its features.
+    of reward functions are linear: they score a segment by the sum of its features. Members that
+    are known to be equal are scored once.
 
     Args:
         population: N members.
         bank: The segments.
         alpha: Temperature of CPL's maximum-entropy policies.
         discount: Per-step discount gamma.
+        wanted: Segments whose scores are needed, ``[W]``, each once; all if None. Scores of others
+            are NaN where leaving them out saves something.
         memory_mb: Bound on the temporaries and on what is kept, in MiB, beside the result itself;
             work is cut into chunks that fit, down to one segment and one member.
         dtype: Precision in which the members' own layers are multiplied. ``torch.bfloat16`` pays
@@ -82,6 +86,7 @@ def segment_scores(
     Returns:
         ``[N, num_segments]`` float32.
     """
+    population, place = population.without_repeats()
     scoring = _Scoring(population, bank, discount, int(memory_mb * 2**18), dtype)
     scores = torch.empty(len(population), len(bank), device=population.device)
     if scoring.can_look_up():
@@ -89,8 +94,9 @@ def segment_scores(
     elif len(scoring.layers) == 1 and isinstance(population.spec, RewardSpec):
         scoring.add_up(scores)
     else:
-        scoring.walk(scores)
-    return scores.mul_(alpha)
+        scoring.walk(scores, wanted)
+    scores.mul_(alpha)
+    return scores if place is None else scores[place]
 
 
 class _Scoring:
@@ -154,6 +160,7 @@ class _Scoring:
         """Heads linear in the features: add these up over the steps, then multiply once."""
         layer = self.layers[0]
         assert isinstance(layer, tuple)
+        assert layer[0] is not None
         heads = layer[0].flatten(1)
         width = heads.shape[1]
         sums = None
@@ -177,19 +184,27 @@ class _Scoring:
         chosen = F.one_hot(action, self.spec.action_dim) * self._weights(part).unsqueeze(-1)
         return (chosen.mT @ features).flatten(1)
 
-    def walk(self, scores: Tensor) -> None:
-        """Look at every step of every segment."""
+    def walk(self, scores: Tensor, wanted: Tensor | None) -> None:
+        """Look at every step of every segment, or of those that are wanted."""
         bank, spec = self.bank, self.spec
+        if wanted is not None and len(wanted) == len(bank):
+            wanted = None
+        if wanted is not None:
+            wanted = wanted.to(bank.row.device)
+            scores.fill_(torch.nan)
         features = self._features()
-        for part in _chunks(len(bank), max(1, self.rows // self.steps)):
+        count = len(bank) if wanted is None else len(wanted)
+        for chunk in _chunks(count, max(1, self.rows // self.steps)):
+            part = chunk if wanted is None else wanted[chunk]
             seen = self._see(bank.row[part].flatten(), features)
-            action = bank.action[part].flatten(0, 1)
+            layers, seen = apply_shared(self.layers, seen)
+            action, weight = bank.action[part].flatten(0, 1), self._weights(part)
             for members in _chunks(len(scores), self.members):
-                output = apply_layers(some_layers(self.layers, members), seen)
+                output = apply_layers(some_layers(layers, members), seen)
                 value = spec.step_scores(output.float(), action).unflatten(1, (-1, self.steps))
-                scores[members, part] = _weighted(value, self._weights(part))
+                scores[members, part] = _weighted(value, weight)
 
-    def _weights(self, part: slice) -> Tensor:
+    def _weights(self, part: slice | Tensor) -> Tensor:
         """What the steps of these segments count for, ``[T]`` or ``[P, T]``."""
         return self.bank.weights(part, discount=self.discount)
 
@@ -238,7 +253,8 @@ def margins(
     Returns:
         ``[N, M]`` float32; a positive margin is a pass.
     """
-    scores = segment_scores(population, bank, alpha=alpha, discount=discount)
+    wanted = comparisons.segments(len(bank))
+    scores = segment_scores(population, bank, alpha=alpha, discount=discount, wanted=wanted)
     return margins_of(scores, comparisons)
 
 

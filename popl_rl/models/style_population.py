@@ -72,6 +72,13 @@ class StyledPopulation(Population):
                 layers.append(activation(layer) or layer)
         return layers
 
+    def without_repeats(self) -> tuple[Population, Tensor | None]:
+        """Members of different codes; many end in the same corner of the box that codes are in."""
+        codes, place = self.members.data["code"].unique(dim=0, return_inverse=True)
+        if len(codes) == len(self):
+            return self, None
+        return StyledPopulation(self.clone, codes), place
+
     @torch.no_grad()
     def constrain_(self) -> None:
         """Put codes back into the box that most of the data's codes lie in."""

@@ -65,6 +65,26 @@ def test_the_seed_decides_everything(bank, comparisons, weight):
     assert not any(map(torch.equal, run(0), run(1)))
 
 
+def test_nobody_has_to_watch(bank, comparisons, weight, monkeypatch):
+    """Without a look at how well it goes hypotheses come out the same, and nothing is scored."""
+
+    def trained(*, watched):
+        method = GroupCPL(
+            Problem(SPEC, bank, comparisons, Training(steps=6, batch_size=8), generations=3),
+            weight=weight,
+            generator=torch.Generator().manual_seed(0),
+        )
+        if watched:
+            while method.generation < method.generations:
+                assert method.step()["worst_rater_accuracy"] >= 0
+        else:
+            monkeypatch.setattr(Problem, "compared_scores", None)
+            train(method)
+        return parameters_of(method)
+
+    assert all(map(torch.equal, trained(watched=True), trained(watched=False)))
+
+
 def test_progress_is_told_by_generations(bank, comparisons, weight, generator):
     seen = []
     method = GroupCPL(short(bank, comparisons), weight=weight, generator=generator)

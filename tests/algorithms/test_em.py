@@ -26,7 +26,7 @@ def build(bank, comparisons, *, seed=0, members=4, groups=2, generations=4, **re
 def given_margins(monkeypatch, margin):
     """Have everybody score preferred segments so, and all others 0."""
     scores = torch.cat([margin, torch.zeros_like(margin)], 1)
-    monkeypatch.setattr(Problem, "scores", lambda *_: scores)
+    monkeypatch.setattr(Problem, "compared_scores", lambda *_: scores)
 
 
 def tensors(popl):

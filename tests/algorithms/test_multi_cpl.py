@@ -49,7 +49,7 @@ def test_what_it_reports_is_what_it_found_by_hand(monkeypatch, bank, comparisons
     popl = build(bank, four, members=2)
     margin = torch.tensor([[1.0, 2.0, 1.0, -1.0], [-1.0, 0.0, 1.0, -1.0]])
     scores = torch.cat([margin, torch.zeros_like(margin)], 1)
-    monkeypatch.setattr(Problem, "scores", lambda *_: scores)
+    monkeypatch.setattr(Problem, "compared_scores", lambda *_: scores)
     metrics = popl.step()
     assert metrics["worst_rater_accuracy"] == pytest.approx(0.55)
     assert metrics["mean_accuracy"] == 0.5

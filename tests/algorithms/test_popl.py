@@ -149,7 +149,7 @@ def one_generation(monkeypatch, bank, margin, comparisons, epsilon):
     rows = torch.arange(len(comparisons))
     comparisons = replace(comparisons, preferred=rows, other=rows + len(rows))
     scores = torch.cat([margin, torch.zeros_like(margin)], 1)
-    monkeypatch.setattr(Problem, "scores", lambda *_: scores)
+    monkeypatch.setattr(Problem, "compared_scores", lambda *_: scores)
     generator = torch.Generator().manual_seed(0)
     spec = PolicySpec(5, 2, True, ())
     population = Population.create(spec, len(margin), generator=generator)

@@ -361,3 +361,18 @@ def test_integer_scales_are_as_good_as_real_ones(bank, generator):
     population = Population.create(PolicySpec(5, 2, True, (3,)), 2, generator=generator)
     whole = segment_scores(population, bank, alpha=1, discount=1)
     assert torch.equal(whole, segment_scores(population, bank))
+
+
+@pytest.mark.parametrize("count", [0, 3, 8])
+def test_only_wanted_segments_need_be_scored(generator, count):
+    """Each has the score that it has among all."""
+    spec = PolicySpec(3, 2, False, (8, 4))
+    population = Population.create(spec, 5, generator=generator)
+    observation = torch.randn(8 * 6, 3, generator=generator)
+    row = torch.arange(48).view(8, 6)
+    bank = SegmentBank(observation, row, torch.randn(8, 6, 2, generator=generator), False)
+    wanted = torch.randperm(8, generator=generator)[:count]
+    found = segment_scores(population, bank, wanted=wanted)
+    assert torch.allclose(found[:, wanted], segment_scores(population, bank)[:, wanted], atol=1e-5)
+    left = torch.ones(8, dtype=torch.bool).index_fill(0, wanted, False)
+    assert bool(found[:, left].isnan().all())

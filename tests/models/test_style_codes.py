@@ -4,6 +4,7 @@ from tensordict import TensorDict
 
 from popl_rl.algorithms.losses import CPLLoss, cpl_loss
 from popl_rl.data.bank import SegmentBank
+from popl_rl.models import scoring
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.policy_set import PolicySet
 from popl_rl.models.population import Population
@@ -113,6 +114,26 @@ def test_scores_do_not_depend_on_the_chunks(styled, bank, memory_mb):
     scores = segment_scores(styled, bank, memory_mb=memory_mb)
     alone = [segment_scores(styled.subset([index]), bank)[0] for index in range(5)]
     assert torch.allclose(scores, torch.stack(alone), atol=1e-4)
+
+
+def test_equal_codes_are_scored_once(clone, bank, monkeypatch):
+    """Every member has the scores of its own network, wherever its code comes again."""
+    codes = torch.stack([clone.low, clone.high, clone.low, clone.typical(), clone.high])
+    population = StyledPopulation(clone, codes)
+    expected = segment_scores(population.plain(), bank)
+    looked_at = []
+    apply_layers = scoring.apply_layers
+
+    def counted(layers, seen):
+        output = apply_layers(layers, seen)
+        looked_at.append(output.shape[0] * output.shape[1])
+        return output
+
+    monkeypatch.setattr(scoring, "apply_layers", counted)
+    assert torch.allclose(segment_scores(population, bank), expected, atol=1e-3)
+    assert sum(looked_at) == 3 * bank.row.numel()
+    distinct = StyledPopulation(clone, codes[[0, 1, 3]])
+    assert distinct.without_repeats() == (distinct, None)
 
 
 def test_only_codes_learn(styled, bank):
