@@ -11,7 +11,10 @@ from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.stacked_adam import StackedAdam
 from popl_rl.models.schedules import decay
 
-__all__ = ["NicheMembers"]
+__all__ = ["GIVEN", "NicheMembers"]
+
+GIVEN = 0.25
+"""Share of the generations in which a division that was found is kept as it is."""
 
 
 class NicheMembers:
@@ -40,8 +43,19 @@ class NicheMembers:
         self.served = responsibility(self.problem, self.stack, self.share)
         self.share = self.served.mean(1)
 
-    def step(self, now: int, last: int) -> float:
-        """Gradient steps of generation ``now`` out of ``last``; returns the loss."""
+    def step(self, now: int, last: int, *, given: float = 1.0) -> float:
+        """Run one generation: an E-step, once members know whom they serve, and gradient steps.
+
+        Args:
+            now: Number of the generation, from 0 on.
+            last: Generations in all, over which the learning rate falls.
+            given: Share of them in which the division is kept as it was given.
+
+        Returns:
+            The last gradient step's loss, averaged over members.
+        """
+        if now >= given * last:
+            self.divide_anew()
         rate = self.problem.training.learning_rate * decay(now, last)
         self.training.optimizer.param_groups[0]["lr"] = rate
         return descend_served(self.problem, self.stack, self.training, self.served, self.generator)

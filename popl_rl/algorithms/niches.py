@@ -7,18 +7,21 @@ searches agree upon (see ``popl_rl.algorithms.agreement``) is judged by the rate
 out, as it was found and, for the numbers that look best, by fresh members (see
 ``popl_rl.algorithms.trials``): the number of niches is taken that predicts people whom nobody has
 learnt of best. A number that was tried counts by the better of its two values, which favours it a
-little. At last, fresh members are trained by the whole recipe on the division of the raters that
-was found: what was learnt while it was wrong would stay otherwise.
+little. Before one niche is taken for everybody, it is divided in two (see
+``popl_rl.algorithms.divided_in_two``). At last, fresh members are trained by the whole recipe on
+the division of the raters that was found: what was learnt while it was wrong would stay otherwise.
 """
 
 import warnings
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from popl_rl.algorithms.agreement import Agreement, agreements
+from popl_rl.algorithms.divided_in_two import divided_in_two
 from popl_rl.algorithms.needed import behind_best, standard_error, sufficient
-from popl_rl.algorithms.niche_members import NicheMembers
+from popl_rl.algorithms.niche_members import GIVEN, NicheMembers
 from popl_rl.algorithms.niche_search import NicheSearch
 from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.trials import Fold, Trial, trials
@@ -30,7 +33,9 @@ from popl_rl.models.scoring import rater_accuracy
 __all__ = ["NichePOPL"]
 
 _SEARCH = 0.44  # of the generations before settling, after which sizes are compared
-_GIVEN = 0.25  # of the generations after settling, in which the division found is kept as it is
+# What two niches must predict better by where searches found one: standard errors (5 %, one-sided),
+# and nats of an answer.
+_SURE, _WORTH = 1.645, 0.002
 
 
 class NichePOPL:
@@ -149,11 +154,8 @@ class NichePOPL:
         return sum(losses) / len(losses)
 
     def _train(self, found: NicheMembers) -> float:
-        """E-step, once members know whom they serve, and gradient steps."""
         now, last = self.generation - self.settled, self.generations - self.settled
-        if now >= _GIVEN * last:
-            found.divide_anew()
-        return found.step(now, last)
+        return found.step(now, last, given=GIVEN)
 
     def _settle(self) -> None:
         """Choose the number of niches by raters held out, and start anew from who is in which."""
@@ -174,6 +176,9 @@ class NichePOPL:
         error = standard_error(behind).tolist()
         number = [one.number for one in agreed]
         self.sizes = list(zip(number, mean, error, strict=True))
+        self.scale = tried[chosen].scale if chosen in tried else best.scale(judged)
+        if best.number == 1:
+            best = self._unless_two(best, values[chosen])
         # Where some members serve nobody, there was room for more.
         most = min(map(len, divided))
         if best.found == most == min(search.sizes[-1] for search in self.searches):
@@ -182,19 +187,37 @@ class NichePOPL:
                 "there may be more groups than members; raise method.members",
                 stacklevel=2,
             )
-        self.scale = tried[chosen].scale if chosen in tried else best.scale(judged)
         self.found = NicheMembers(self.problem, best.served(self.problem), generator=self.generator)
+
+    def _unless_two(self, one: Agreement, value: Tensor) -> Agreement:
+        """One niche for everybody, unless a division in two predicts raters surely better."""
+        folds, generations = self._folds(), self._trial_generations()
+        two = divided_in_two(
+            self.problem, folds, value, generations=generations, generator=self.generator
+        )
+        if two is None:
+            return one
+        both = torch.stack([value, two.value])
+        behind = behind_best(both)
+        if sufficient(behind, evidence=_SURE, negligible=_WORTH) == 0:
+            return one
+        mean, error = both.mean(1).tolist(), standard_error(behind).tolist()
+        self.sizes = list(zip((1, 2), mean, error, strict=True))
+        self.scale = two.scale([fold.judged for fold in folds])
+        return two
 
     def _try_out(self, agreed: list[Agreement]) -> dict[int, Trial]:
         """Trials of the numbers that look best, with the steps of ``niches.trial_steps``."""
+        generations = self._trial_generations()
+        folds, generator = self._folds(), self.generator
+        return trials(self.problem, folds, agreed, generations=generations, generator=generator)
+
+    def _folds(self) -> list[Fold]:
+        return [Fold(search.problem, search.judged) for search in self.searches]
+
+    def _trial_generations(self) -> int:
         generations = -(-self.settings.trial_steps // self.problem.block)
-        return trials(
-            self.problem,
-            [Fold(search.problem, search.judged) for search in self.searches],
-            agreed,
-            generations=min(generations, self.problem.generations),
-            generator=self.generator,
-        )
+        return min(generations, self.problem.generations)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the next generation depends on."""
