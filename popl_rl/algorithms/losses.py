@@ -8,7 +8,7 @@ from torchrl.objectives.common import LossModule
 from popl_rl.algorithms.draws import Draws, uniform
 from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
-from popl_rl.models.population import Population
+from popl_rl.models.population import Population, added_up
 from popl_rl.models.preference_likelihood import drawn_likelihood, log_likelihood
 from popl_rl.optim import take_step
 
@@ -189,20 +189,12 @@ class CPLLoss(LossModule):
         Returns:
             ``[N, B]``.
         """
-        bank = self.bank
+        bank, population = self.bank, self.population
+        weight = self.alpha * bank.weights(segment, discount=self.discount)
         if bank.is_shared and len(bank.observation) <= segment.shape[-1] * bank.row.shape[1]:
             value = self._looked_up(segment)
-        else:
-            row, action = bank.row[segment], bank.action[segment]
-            output = self.population(bank.observation[row].flatten(-3, -2))
-            action = action.flatten(segment.ndim - 1, segment.ndim)
-            value = self.population.spec.step_scores(output, action)
-        value = value.view(len(self.population), segment.shape[-1], -1)
-        weight = self.alpha * bank.weights(segment, discount=self.discount)
-        if weight.ndim > 1:
-            return (value * weight).sum(-1)
-        scores: Tensor = value @ weight
-        return scores
+            return added_up(value.view(len(population), segment.shape[-1], -1), weight)
+        return population.drawn_scores(bank, segment, weight)
 
     def _looked_up(self, segment: Tensor) -> Tensor:
         """Scores of steps ``[N, B * T]``: each distinct observation is looked at once."""

@@ -114,6 +114,6 @@ def ask_new_raters(
                     "queries; lower the tie and skip thresholds"
                 )
             for answers in curve:
-                choice = hypotheses.cater(bank, said[:answers])
+                choice = hypotheses.cater(bank, said[:answers], scores=scores)
                 picks[CHOICE, answers].append(choice.member)
     return {point: torch.tensor(chosen).view(len(groups), -1) for point, chosen in picks.items()}

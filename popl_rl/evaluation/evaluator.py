@@ -139,10 +139,7 @@ class Evaluator:
 
     @cached_property
     def new_raters(self) -> list[list[TensorDict]]:
-        """What several new raters of each group answer: the same whatever is being judged.
-
-        Each answers as often as any point of a curve needs; fewer answers are the first of these.
-        """
+        """What new raters of each group answer, whoever is judged; fewer are the first of these."""
         answers = max([self.protocol.answers, *self.protocol.curve])
         said = []
         for index in range(len(self.groups)):
@@ -163,7 +160,12 @@ class Evaluator:
         return said
 
     def cater(
-        self, hypotheses: HypothesisSet, method: str, *, answers: int | None = None
+        self,
+        hypotheses: HypothesisSet,
+        method: str,
+        *,
+        answers: int | None = None,
+        scores: Tensor | None = None,
     ) -> Tensor:
         """Member given to each of several new raters of each group, ``[G, raters]``.
 
@@ -171,12 +173,12 @@ class Evaluator:
             hypotheses: What is chosen from.
             method: How, see ``popl_rl.models.hypothesis_set.HypothesisSet.cater``.
             answers: Answers that are known of each; as configured if None.
+            scores: As of ``scores``, where they are known.
         """
-        known = self.protocol.answers if answers is None else answers
-        how: Any = {"method": method}
-        picks = []
+        picks, known = [], self.protocol.answers if answers is None else answers
         for index, raters in enumerate(self.new_raters):
-            how["generator"] = stream(self.seed, f"lexicase catering/{index}/{known}")
+            generator = stream(self.seed, f"lexicase catering/{index}/{known}")
+            how: Any = {"method": method, "scores": scores, "generator": generator}
             picks += [hypotheses.cater(self.bank, said[:known], **how).member for said in raters]
         return torch.tensor(picks).view(len(self.groups), -1)
 
@@ -289,10 +291,11 @@ class Evaluator:
         self, found: HypothesisSet, label: str, rows: Rows, *, curve: Sequence[int]
     ) -> Served:
         """What new raters are given, and what it is worth to them beside the best there is."""
-        accuracy = self.accuracy(found)
-        picks = {method: self.cater(found, method) for method in _CATERING}
+        scores = self.scores(found)
+        accuracy = group_accuracy(scores, self.pairs)
+        picks = {method: self.cater(found, method, scores=scores) for method in _CATERING}
         points = {
-            (method, answers): self.cater(found, method, answers=answers)
+            (method, answers): self.cater(found, method, answers=answers, scores=scores)
             for answers in curve
             for method in _CATERING
         }
@@ -307,15 +310,13 @@ class Evaluator:
         for index in range(len(self.groups)):
             most = float(accuracy[:, index].max())
             for method, chosen in picks.items():
-                entry = label, method
-                share = served.share(index, chosen)
-                rows.add(entry, index, done, share, raters=chosen.shape[1])
-                given = accuracy[chosen[index], index]
-                rows.add_accuracy(entry, index, catered=given, best=most)
+                share, given = served.share(index, chosen), accuracy[chosen[index], index]
+                rows.add((label, method), index, done, share, raters=chosen.shape[1])
+                rows.add_accuracy((label, method), index, catered=given, best=most)
         score_hindsight(rows, label, done, [members.index(int(one)) for one in accurate])
         score_curves(rows, label, served, points, accuracy)
         if curve:
-            self._score_chosen(found, label, rows, served, accuracy, curve=curve, limit=limit)
+            self._score_chosen(found, label, rows, served, scores, curve=curve, limit=limit)
         return served
 
     def _score_chosen(
@@ -324,7 +325,7 @@ class Evaluator:
         label: str,
         rows: Rows,
         served: Served,
-        accuracy: Tensor,
+        scores: Tensor,
         *,
         curve: Sequence[int],
         limit: int,
@@ -334,7 +335,7 @@ class Evaluator:
             found,
             self.groups,
             self.bank,
-            self.scores(found),
+            scores,
             self.segment_utility,
             raters=self.protocol.new_raters,
             curve=curve,
@@ -345,7 +346,7 @@ class Evaluator:
         if not set(wanted) <= set(served.members):
             done = self._perform(found.subset(wanted))
             served = Served(served.picks, wanted, done, served.fair)
-        score_curves(rows, label, served, points, accuracy)
+        score_curves(rows, label, served, points, group_accuracy(scores, self.pairs))
 
     def _score_as_a_whole(
         self,

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, Self, cast
+from typing import Any, Literal, Self, cast
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
@@ -109,6 +109,7 @@ class _Encoded(HypothesisSet):
         *,
         method: Literal["posterior", "lexicase"] = "posterior",
         mistake: float = 0.05,
+        scores: Tensor | None = None,
         generator: torch.Generator | None = None,
     ) -> Catered:
         """Choose a hypothesis for one rater from a few answers.
@@ -120,15 +121,15 @@ class _Encoded(HypothesisSet):
                 believed in most, the nearest in units of the encoder's standard deviations.
                 ``"lexicase"``: as ``HypothesisSet.cater``.
             mistake: Not used.
+            scores: As for ``HypothesisSet.cater``; used by ``"lexicase"`` alone.
             generator: Source of the lexicase draw.
 
         Raises:
             ValueError: If no answer is strict, or the arguments are off.
         """
         if method != "posterior" or not len(answers):
-            return super().cater(
-                segments, answers, method=method, mistake=mistake, generator=generator
-            )
+            how: dict[str, Any] = {"method": method, "mistake": mistake, "scores": scores}
+            return super().cater(segments, answers, generator=generator, **how)
         comparisons = Comparisons.from_preferences(answers, cases="preference")
         device = self.population.device
         bank = segments if isinstance(segments, SegmentBank) else self._bank(segments)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, cast
 
@@ -15,6 +15,7 @@ from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.data.pairs import draw_pairs, starts_of
 from popl_rl.keys import ANSWER, PAIR, Answer
+from popl_rl.models.catered import Catered
 from popl_rl.models.policies import PolicySpec
 from popl_rl.models.population import Population
 from popl_rl.models.preference_likelihood import MISTAKE, log_likelihood
@@ -32,19 +33,6 @@ from popl_rl.models.set_files import VERSION, read_about, read_population, write
 from popl_rl.selection.lexicase import lexicase_selection
 
 __all__ = ["Catered", "HypothesisSet"]
-
-
-@dataclass(frozen=True)
-class Catered:
-    """A choice from a set for one rater.
-
-    Attributes:
-        member: The chosen hypothesis.
-        weights: Belief in each hypothesis, ``[N]``, summing to 1.
-    """
-
-    member: int
-    weights: Tensor
 
 
 class HypothesisSet:
@@ -142,6 +130,7 @@ class HypothesisSet:
         *,
         method: Literal["posterior", "lexicase"] = "posterior",
         mistake: float = MISTAKE,
+        scores: Tensor | None = None,
         generator: torch.Generator | None = None,
     ) -> Catered:
         """Choose a hypothesis for one rater from a few answers.
@@ -157,6 +146,8 @@ class HypothesisSet:
                 most. ``"lexicase"``: one lexicase selection over the answers, as in the POPL
                 paper; needs ``generator``.
             mistake: Chance of a slip, which keeps single answers from ruling a policy out.
+            scores: Of all segments in the eyes of all hypotheses, ``[N, segments]``, where somebody
+                knows them, who asks for many people; worked out if None.
             generator: Source of the lexicase draw.
 
         Returns:
@@ -170,7 +161,10 @@ class HypothesisSet:
         if not len(answers):
             return self._unasked()
         comparisons = Comparisons.from_preferences(answers, cases="preference")
-        margin = self.margins(segments, comparisons).cpu()
+        if scores is None:
+            margin = self.margins(segments, comparisons).cpu()
+        else:
+            margin = margins_of(scores.cpu(), comparisons.to("cpu"))
         if method == "posterior":
             log_weight = log_likelihood(margin, mistake).sum(1)
             return Catered(int(log_weight.argmax()), log_weight.softmax(0))

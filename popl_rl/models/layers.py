@@ -32,18 +32,23 @@ def activation(layer: nn.Module) -> nn.Module | None:
 
 def apply_layers(layers: Sequence[Layer], features: Tensor) -> Tensor:
     """Own layers of N members on features ``[R, F]`` or ``[N, R, F]``, ``[N, R, K]``."""
-    hidden = features
+    hidden, shape = features, torch.Size()
     for layer in layers:
         if isinstance(layer, nn.Module):
             hidden = layer(hidden)
             continue
         weight, bias = layer
+        if shape and (weight is None or weight.ndim > 2):
+            hidden, shape = hidden.view(*shape, -1), torch.Size()
         if weight is None:
             hidden = hidden if bias is None else hidden + bias.unsqueeze(-2)
             continue
         if weight.ndim == 2:
             if bias is None or bias.ndim == 1:
-                hidden = F.linear(hidden, weight, bias)
+                # As one matrix until the end: autograd copies what is changed in place, as by ReLU,
+                # if it is a view, such as a matrix in another shape.
+                shape = hidden.shape[:-1] if hidden.ndim > 2 else shape
+                hidden = F.linear(hidden.flatten(0, -2), weight, bias)
             else:
                 hidden = F.linear(hidden, weight) + bias.unsqueeze(1)
             continue
@@ -62,7 +67,7 @@ def apply_layers(layers: Sequence[Layer], features: Tensor) -> Tensor:
             hidden = torch.bmm(hidden, weight.mT)
         else:
             hidden = torch.baddbmm(bias.unsqueeze(1), hidden, weight.mT)
-    return hidden
+    return hidden.view(*shape, -1) if shape else hidden
 
 
 def apply_shared(layers: Sequence[Layer], features: Tensor) -> tuple[list[Layer], Tensor]:

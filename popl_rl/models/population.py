@@ -7,11 +7,18 @@ import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from torch import Tensor, nn
 
+from popl_rl.data.bank import SegmentBank
 from popl_rl.models.layers import Layer, activation, apply_layers
 from popl_rl.models.policies import Spec, build_network
 from popl_rl.models.trunk_cache import TrunkCache
 
-__all__ = ["Population"]
+__all__ = ["Population", "added_up"]
+
+
+def added_up(value: Tensor, weight: Tensor) -> Tensor:
+    """Sums over steps ``[..., T] -> [...]``, with weights ``[T]`` for all, or for each its own."""
+    summed: Tensor = value @ weight if weight.ndim == 1 else (value * weight).sum(-1)
+    return summed
 
 
 class Population(nn.Module):
@@ -102,6 +109,22 @@ class Population(nn.Module):
     def from_features(self, features: Tensor) -> Tensor:
         """The members' own layers, applied to outputs of the trunk ``[R, F]`` or ``[N, R, F]``."""
         return apply_layers(self.layers(), features)
+
+    def drawn_scores(self, bank: SegmentBank, segment: Tensor, weight: Tensor) -> Tensor:
+        """Differentiable scores of each member's own segments, or of segments that all share.
+
+        Args:
+            bank: Segments of T steps.
+            segment: Segment numbers ``[N, B]``, or ``[B]``, the same for every member.
+            weight: What each step counts for, ``[T]``, or like ``segment`` with T behind.
+
+        Returns:
+            ``[N, B]``.
+        """
+        output = self(bank.observation[bank.row[segment]].flatten(-3, -2))
+        action = bank.action[segment].flatten(segment.ndim - 1, segment.ndim)
+        value = self.spec.step_scores(output, action)
+        return added_up(value.view(len(self), segment.shape[-1], -1), weight)
 
     def layers(self) -> list[Layer]:
         """The members' own layers, stacked: weights ``[N, K, F]`` and biases ``[N, K]``."""

@@ -11,7 +11,7 @@ from popl_rl.data.bank import SegmentBank
 from popl_rl.data.comparisons import Comparisons
 from popl_rl.models.convolutions import Patches
 from popl_rl.models.layers import apply_layers, apply_shared, change_layers, some_layers
-from popl_rl.models.population import Population
+from popl_rl.models.population import Population, added_up
 from popl_rl.models.reward_functions import RewardSpec
 
 __all__ = [
@@ -35,11 +35,6 @@ _ROWS = 1024  # observations looked at together
 _MARGINS = 2**22
 
 _BLOCK = 2**18  # outputs of a layer, over these observations and some members
-
-
-def _weighted(value: Tensor, weight: Tensor) -> Tensor:
-    """Sums over steps ``[..., P, T] -> [..., P]``, with one weight for all segments or one each."""
-    return value @ weight if weight.ndim == 1 else (value * weight).sum(-1)
 
 
 def _chunks(total: int, size: int) -> Iterator[slice]:
@@ -202,7 +197,7 @@ class _Scoring:
             for members in _chunks(len(scores), self.members):
                 output = apply_layers(some_layers(layers, members), seen)
                 value = spec.step_scores(output.float(), action).unflatten(1, (-1, self.steps))
-                scores[members, part] = _weighted(value, weight)
+                scores[members, part] = added_up(value, weight)
 
     def _weights(self, part: slice | Tensor) -> Tensor:
         """What the steps of these segments count for, ``[T]`` or ``[P, T]``."""

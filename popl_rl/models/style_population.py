@@ -4,9 +4,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from torch import Tensor, nn
 
+from popl_rl.data.bank import SegmentBank
 from popl_rl.models.layers import Layer, activation
 from popl_rl.models.population import Population
 from popl_rl.models.style_codes import StyleClone
+from popl_rl.models.style_scores import ShiftedNetwork, shifted_scores
 
 __all__ = ["StyledPopulation"]
 
@@ -63,8 +65,7 @@ class StyledPopulation(Population):
 
     def layers(self) -> list[Layer]:
         """The clone's layers, shared by all members but for the first bias, ``[N, H]``."""
-        seen, told, bias = self.clone.first_layer()
-        layers: list[Layer] = [(seen, bias + self.members["code"] @ told.T)]
+        layers: list[Layer] = [(self.clone.first_layer()[0], self._first_bias())]
         for layer in list(self.clone.network)[1:]:
             if isinstance(layer, nn.Linear):
                 layers.append((layer.weight, layer.bias))
@@ -78,6 +79,25 @@ class StyledPopulation(Population):
         if len(codes) == len(self):
             return self, None
         return StyledPopulation(self.clone, codes), place
+
+    def drawn_scores(self, bank: SegmentBank, segment: Tensor, weight: Tensor) -> Tensor:
+        """See ``popl_rl.models.population.Population``."""
+        # Blocks are so small for a processor's cache; a GPU would wait for each of them.
+        if not torch.is_grad_enabled() or self.device.type != "cpu":
+            return super().drawn_scores(bank, segment, weight)
+        later = [
+            (layer.weight, layer.bias)
+            for layer in list(self.clone.network)[1:]
+            if isinstance(layer, nn.Linear)
+        ]
+        network = ShiftedNetwork(self.clone.spec, self.clone.first_layer()[0], later)
+        return shifted_scores(self._first_bias(), network, bank, segment, weight)
+
+    def _first_bias(self) -> Tensor:
+        """What the first layer adds for each member, ``[N, H]``."""
+        _, told, bias = self.clone.first_layer()
+        shift: Tensor = bias + self.members["code"] @ told.T
+        return shift
 
     @torch.no_grad()
     def constrain_(self) -> None:

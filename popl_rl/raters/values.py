@@ -82,7 +82,9 @@ def fit_value(
         target = ((ahead + after.unsqueeze(1)) / scale).flatten()
         for _ in range(steps):
             row = torch.randint(len(flat), (batch_size,), generator=generator)
-            loss = (network(inputs[row]).squeeze(-1) - target[row]).square().mean()
+            # A choice of rows that lie together: several times as fast as ``inputs[row]``.
+            seen, worth = inputs.index_select(0, row), target.index_select(0, row)
+            loss = (network(seen).squeeze(-1) - worth).square().mean()
             take_step(optimizer, loss)
     return value
 

@@ -273,7 +273,7 @@ def test_members_are_rolled_once_and_no_more_than_allowed(curious, baselines, mo
     policies = walkers(4.0, 0.0, -4.0, 3.0, -3.0)
     given = {None: 0, 10: 0, 25: 3, 1: 4}
     monkeypatch.setattr(
-        curious, "cater", lambda *_, answers=None: torch.full((2, 4), given[answers])
+        curious, "cater", lambda *_, answers=None, **__: torch.full((2, 4), given[answers])
     )
     fair = policies.fair(curious.bank, curious.held_out[0])
     always = len({0, 2, fair})

@@ -75,6 +75,22 @@ def test_belief_uses_the_sets_own_scale(steps):
     torch.testing.assert_close(weights, torch.tensor([one, 0.5]) / (one + 0.5))
 
 
+@pytest.mark.parametrize("method", ["posterior", "lexicase"])
+def test_scores_that_are_known_are_not_worked_out(two, steps, method, monkeypatch):
+    said = answers(FIRST, TIE, SECOND)
+    scores = segment_scores(two.population, SegmentBank.from_segments(steps), alpha=two.alpha)
+
+    def choice(**known):
+        generator = torch.Generator().manual_seed(0)
+        return two.cater(steps, said, method=method, generator=generator, **known)
+
+    expected = choice()
+    monkeypatch.setattr(PolicySet, "margins", None)
+    found = choice(scores=scores)
+    assert found.member == expected.member
+    torch.testing.assert_close(found.weights, expected.weights)
+
+
 def test_belief_survives_impossible_answers(steps):
     """Policies that are sure of the contrary of an answer still get finite weights."""
     policies = PolicySet(linear_policies([-500.0, 500.0], [-400.0, 600.0]))

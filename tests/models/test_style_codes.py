@@ -136,6 +136,39 @@ def test_equal_codes_are_scored_once(clone, bank, monkeypatch):
     assert distinct.without_repeats() == (distinct, None)
 
 
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize(
+    "spec", [SPEC, PolicySpec(2, 3, True, (6, 5)), PolicySpec(2, 2, False, ())], ids=str
+)
+def test_scores_and_gradients_are_those_of_autograd(generator, spec, masked, shared):
+    """Of whole batches at once; by blocks of a few segments here."""
+    shape = 40, 8 if spec.discrete else 64
+    observation = torch.randn(shape[0] * shape[1], 2, generator=generator)
+    row = torch.arange(len(observation)).view(shape)
+    mask = torch.rand(shape, generator=generator) < 0.7 if masked else None
+    action = torch.randn(*shape, spec.action_dim, generator=generator)
+    if spec.discrete:
+        action = torch.randint(spec.action_dim, shape, generator=generator)
+    bank = SegmentBank(observation, row, action, False, mask)
+    clone = StyleClone(spec, torch.randn(9, 2, generator=generator))
+    population = StyledPopulation(clone, clone.draw(3, generator=generator))
+    segment = torch.randint(40, (50,) if shared else (3, 50), generator=generator)
+    weight = 0.3 * bank.weights(segment, discount=0.9)
+    slope = torch.randn(3, 50, generator=generator)
+
+    def scored(way):
+        scores = way(population, bank, segment, weight)
+        (gradient,) = torch.autograd.grad((scores * slope).sum(), population.members.parameters())
+        return scores, gradient
+
+    found, expected = scored(StyledPopulation.drawn_scores), scored(Population.drawn_scores)
+    torch.testing.assert_close(found[0], expected[0], atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(found[1], expected[1], atol=1e-4, rtol=1e-5)
+    with torch.no_grad():
+        assert torch.equal(population.drawn_scores(bank, segment, weight), expected[0])
+
+
 def test_only_codes_learn(styled, bank):
     before = {name: value.clone() for name, value in styled.clone.state_dict().items()}
     loss = CPLLoss(styled, bank, alpha=0.1, conservatism=1.0)
