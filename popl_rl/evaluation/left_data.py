@@ -20,6 +20,7 @@ __all__ = ["DataRegion", "score_region"]
 _INSIDE = 0.95  # share of held-out data that is inside by definition
 _REFERENCE, _QUERY = 8000, 2000  # observations that distances are measured to, and from, at most
 _LEAST_STD = 1e-2  # a number that hardly ever changes is not blown up
+_STARTS = 20  # of fewer different ones a new episode has one of them, as held-out data may
 _WIDEST = 1000  # numbers in an observation beyond which distances say nothing: pixels
 
 
@@ -27,7 +28,9 @@ class DataRegion:
     """The observations that are as near to the data as 95 % of held-out data are.
 
     Near is the Euclidean distance to the nearest of up to 8000 observations of half of the
-    segments, in standard deviations of each number; the other half is held out.
+    segments, in standard deviations of each number; the other half is held out. Segments with the
+    same first observation stay together where there are 20 such observations or more: new episodes
+    begin elsewhere, and so must what is held out.
 
     Args:
         bank: N segments, two or more.
@@ -38,7 +41,8 @@ class DataRegion:
         self._generator = stream(seed, "region of the data")
         row = bank.row.cpu()
         there = torch.ones_like(row, dtype=torch.bool) if bank.mask is None else bank.mask.cpu()
-        order = torch.randperm(len(row), generator=self._generator)
+        first = bank.observation.cpu()[row[:, 0]].flatten(1)
+        order = _together(torch.randperm(len(row), generator=self._generator), first)
         near, held = (
             bank.observation.cpu()[self._some(row[half][there[half]], most)].float()
             for half, most in zip(order.tensor_split(2), (_REFERENCE, _QUERY), strict=True)
@@ -61,6 +65,22 @@ class DataRegion:
 
     def _distance(self, observation: Tensor) -> Tensor:
         return torch.cdist(self._scaled(observation), self._near).amin(1)
+
+
+def _together(order: Tensor, first: Tensor) -> Tensor:
+    """The order of segments, with those behind each other that begin alike.
+
+    Args:
+        order: The N segments in random order.
+        first: Their first observations, ``[N, O]``.
+    """
+    start = first.unique(dim=0, return_inverse=True)[1]
+    count = int(start.max()) + 1
+    if count < _STARTS:
+        return order
+    place = order.argsort()
+    foremost = torch.full((count,), len(order)).scatter_reduce(0, start, place, "amin")
+    return (foremost[start] * len(order) + place).argsort()
 
 
 def score_region(

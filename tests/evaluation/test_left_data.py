@@ -33,6 +33,28 @@ def test_what_is_like_the_data_is_inside_and_what_is_far_is_not(drawn, generator
     assert region.share(alike + torch.tensor([0.0, 10.0])) > 0.9  # small for that number
 
 
+def test_a_new_start_is_not_far_because_segments_share_theirs(generator):
+    """Walks of which two begin alike and stay close: the other one held out would say little."""
+    spread = torch.randn(1200, 1, 3, generator=generator) * 5
+    walk = torch.arange(10.0)[:, None] * 0.01 * torch.ones(3)
+    noise = 0.001 * torch.randn(800, 10, 3, generator=generator)
+    noise[:, 0] = 0
+    observation = spread[torch.arange(800) % 400] + walk + noise
+    steps = {"observation": observation, "action": torch.zeros(800, 10, dtype=torch.int64)}
+    region = DataRegion(SegmentBank.from_segments(TensorDict(steps, [800, 10])), seed=0)
+    fresh = (spread[400:] + walk).flatten(0, 1)
+    assert region.share(fresh) == pytest.approx(0.95, abs=0.03)
+
+
+def test_segments_of_a_few_starts_are_held_out_one_by_one(generator):
+    begin = torch.tensor([[0.0], [100.0]])[torch.arange(200) % 2]
+    walk = torch.arange(10.0) + 0.01 * torch.randn(200, 10, generator=generator)
+    walk[:, 0] = 0
+    observation = (begin + walk).unsqueeze(-1)
+    steps = {"observation": observation, "action": torch.zeros(200, 10, dtype=torch.int64)}
+    assert DataRegion(SegmentBank.from_segments(TensorDict(steps, [200, 10])), seed=0).edge < 0.01
+
+
 def test_steps_after_an_episode_and_fillers_of_segments_do_not_count(drawn, groups):
     mask = torch.arange(10) < 5
     filled = drawn.observation.view(200, 10, 2).clone()
