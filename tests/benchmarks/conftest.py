@@ -14,6 +14,8 @@ import pytest
 import torch
 from pytest_benchmark.fixture import BenchmarkFixture
 
+from popl_rl.memory import keep_freed_memory
+
 Say = Callable[[str], None]
 Run = Callable[[], object]
 
@@ -37,6 +39,7 @@ class Race(Protocol):
 
 @pytest.fixture(autouse=True)
 def _one_thread() -> Iterator[None]:
+    keep_freed_memory()  # as runs do
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
