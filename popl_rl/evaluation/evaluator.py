@@ -252,7 +252,7 @@ class Evaluator:
         best = None if ppo is None else self._perform(ppo)
         score_references(rows, self.acting, ppo=best, exact=self._exact)
         rows.add_worst()
-        return Scoreboard(rows.table(), catered, episodes, label)
+        return Scoreboard(rows.table(), catered, episodes, label, served)
 
     def _perform(self, hypotheses: HypothesisSet | None) -> Performance:
         """Episodes of every hypothesis, and exact returns where the optimum is known."""

@@ -39,12 +39,14 @@ class Scoreboard:
         catered: Member that a first new rater of each group was given, by group name.
         episodes: Episodes ``[1, E, H]`` behind the pictures, by method and group name.
         label: Name of the method whose set was evaluated.
+        served: Members of its set that were rolled out; None where nobody acted.
     """
 
     results: pd.DataFrame
     catered: dict[str, int]
     episodes: dict[tuple[str, str], TensorDict]
     label: str = "popl"
+    served: "Served | None" = None
 
     def value(self, method: str, group: str, measure: str, choice: str | None = None) -> float:
         """One number of the table.

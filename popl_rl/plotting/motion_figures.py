@@ -20,7 +20,7 @@ from popl_rl.models.policy_set import PolicySet
 from popl_rl.plotting.animation import record_gif
 from popl_rl.plotting.motion_plots import plane, profiles
 
-__all__ = ["animate", "draw_motion", "profile"]
+__all__ = ["animate", "draw_motion", "places_of", "profile"]
 
 _MOST = 32  # policies that are rolled out for a picture
 
@@ -61,11 +61,31 @@ def draw_motion(
             # One policy for everybody, whoever judges it.
             marks["pooled CPL"] = _place(episodes, evaluator)[0].tolist()
             curves["pooled CPL"] = profile(episodes[0], measure)
-    places = _place(evaluator.acting(shown), evaluator)
+    places = places_of(found, len(shown), board, evaluator)
     return {
         "plane": plane(places.numpy(), serves, names, measure=measure, marks=marks),
         "profiles": profiles(curves, measure=measure),
     }
+
+
+def places_of(found: PolicySet, count: int, board: Scoreboard, evaluator: Evaluator) -> Tensor:
+    """Steps to success and mean peak of the first members of a set, ``[count, 2]``.
+
+    Args:
+        found: The set.
+        count: How many.
+        board: Episodes of the members that were rolled out for it are not rolled out again.
+        evaluator: Rolls out the others.
+    """
+    done = {}
+    if board.served is not None:
+        places = _place(board.served.performance.episodes, evaluator)
+        done = dict(zip(board.served.members, places, strict=True))
+    new = [member for member in range(count) if member not in done]
+    if new:
+        places = _place(evaluator.acting(found.subset(new)), evaluator)
+        done |= dict(zip(new, places, strict=True))
+    return torch.stack([done[member] for member in range(count)])
 
 
 def _place(episodes: TensorDictBase, evaluator: Evaluator) -> Tensor:
