@@ -90,9 +90,9 @@ class ResultTable:
 
         Returns:
             The table; a cell is mean ± 95 % interval over seeds [lowest], without an interval below
-            three seeds, or – without rows. With ``against``, mean of the differences ± 95 %
-            interval, and an asterisk where it is not 0 at a level of 5 % for all cells together
-            (Holm, 1979; t-tests paired over seeds).
+            three seeds, one seed's value alone, or – without rows. With ``against``, mean of the
+            differences ± 95 % interval, and an asterisk where it is not 0 at a level of 5 % for all
+            cells together (Holm, 1979; t-tests paired over seeds).
 
         Raises:
             ValueError: If ``results`` lacks a column.
@@ -312,4 +312,5 @@ def _cell(values: Sequence[float]) -> str:
     mean, half = interval(values)
     # Of two seeds it is 13 standard errors wide, and says nothing.
     spread = f" ± {half:.2f}" if len(values) > 2 else ""
-    return f"{number_text(mean)}{spread} [{number_text(min(values))}]"
+    lowest = f" [{number_text(min(values))}]" if len(values) > 1 else ""
+    return f"{number_text(mean)}{spread}{lowest}"
