@@ -30,7 +30,7 @@ def test_rows_are_taken_over_and_shown(checkout, tmp_path):
     kept = pd.read_csv(checkout / "configs" / "results" / "s.csv")
     assert kept["value"].tolist() == [0.25]
     for page in (checkout / "README.md", checkout / "configs" / "README.md"):
-        assert "| pooled CPL | 0.25 [0.25] |\n<!-- end -->" in page.read_text()
+        assert "| pooled CPL | 0.25 |\n<!-- end -->" in page.read_text()
 
 
 def test_what_is_missing_is_said(checkout, tmp_path, capsys):
