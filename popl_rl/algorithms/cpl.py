@@ -56,8 +56,8 @@ class GroupCPL(MultiCPL):
         super().__init__(problem, population=population, generator=generator)
         self.draws = by_comparison(problem.comparisons, weight.to(problem.device))
 
-    def _unscored_draws(self) -> Draws | None:
-        return self.draws
+    def _draws(self, scores: Callable[[], Tensor]) -> tuple[Draws, dict[str, float]]:  # noqa: ARG002
+        return self.draws, {}
 
     def result(self) -> HypothesisSet:
         """The K hypotheses, in the order of the weights."""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from popl_rl.algorithms.agreement import Agreement
 from popl_rl.algorithms.divisions import Division, prediction
-from popl_rl.algorithms.niche_members import GIVEN, NicheMembers
+from popl_rl.algorithms.niche_members import GIVEN, train_niches
 from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.trials import Fold
 
@@ -54,9 +54,9 @@ def divided_in_two(
 
 def _in_two(fold: Fold, served: Tensor, generations: int, generator: torch.Generator) -> Division:
     """Two members of one fold, and how they predict its other raters."""
-    both = NicheMembers(fold.learnt, served, generator=generator)
-    for generation in range(generations):
-        both.step(generation, generations, given=GIVEN)
+    both = train_niches(
+        fold.learnt, served, generations=generations, given=GIVEN, generator=generator
+    )
     niche = torch.arange(2, device=served.device)
     value = prediction(fold.judged.margins(both.stack), fold.judged.comparisons)
     return Division(both.stack, both.share, niche, value)

@@ -6,6 +6,7 @@ responsibilities in the place of hard ones. On two doors hard ones were no bette
 known, and told two groups apart from preferences alone in none of eight starts, soft ones in two.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -52,8 +53,8 @@ class EM(MultiCPL):
         super().__init__(problem, population=population, generator=generator)
         self.share = torch.full((starts, groups), 1 / groups, device=problem.device)
 
-    def _draws(self, scores: Tensor) -> tuple[Draws, dict[str, float]]:
-        belongs, evidence = self._expect(scores)
+    def _draws(self, scores: Callable[[], Tensor]) -> tuple[Draws, dict[str, float]]:
+        belongs, evidence = self._expect(scores())
         likelihood = evidence.mean(1)
         self.share = belongs.mean(2)
         about = {
@@ -61,9 +62,6 @@ class EM(MultiCPL):
             "smallest_share": float(self.share[likelihood.argmax()].min()),
         }
         return by_case(self.problem.comparisons, belongs.flatten(0, 1)), about
-
-    def _unscored_draws(self) -> Draws | None:
-        return None
 
     def _expect(self, scores: Tensor) -> Expectation:
         """Responsibilities ``[R, K, C]`` and evidence ``[R, C]`` of every mixture."""

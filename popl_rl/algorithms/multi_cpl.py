@@ -1,5 +1,6 @@
 """Several CPL hypotheses side by side, each trained on comparisons that it draws by its weights."""
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -58,7 +59,7 @@ class MultiCPL:
         """
         scores = self.problem.compared_scores(self.population)
         passed = pass_shares(scores, self.problem.comparisons)
-        draws, about = self._draws(scores)
+        draws, about = self._draws(lambda: scores)
         return {
             "worst_rater_accuracy": rater_accuracy(passed.values),
             "mean_accuracy": passed.mean,
@@ -71,11 +72,8 @@ class MultiCPL:
 
         Hypotheses end as after ``step``. To score them takes longer than to train a few.
         """
-        draws = self._unscored_draws()
-        if draws is None:
-            self.step()
-        else:
-            self._train(draws)
+        draws, _ = self._draws(lambda: self.problem.compared_scores(self.population))
+        self._train(draws)
 
     def _train(self, draws: Draws) -> dict[str, float]:
         # Everybody is the one child of itself.
@@ -84,17 +82,11 @@ class MultiCPL:
         self.generation += 1
         return trained
 
-    def _draws(self, scores: Tensor) -> tuple[Draws, dict[str, float]]:  # noqa: ARG002
-        """How often each member draws each comparison, and scalars to log."""
-        draws = self._unscored_draws()
-        assert draws is not None
-        return draws, {}
-
-    def _unscored_draws(self) -> Draws | None:
-        """How often each member draws each comparison; None where scores decide."""
+    def _draws(self, scores: Callable[[], Tensor]) -> tuple[Draws, dict[str, float]]:  # noqa: ARG002
+        """How often each member draws each comparison, and scalars to log; scores if asked for."""
         comparisons = self.problem.comparisons
         weight = torch.ones(len(self.population), comparisons.num_cases, device=self.problem.device)
-        return by_case(comparisons, weight)
+        return by_case(comparisons, weight), {}
 
     def result(self) -> HypothesisSet:
         """One member for each distinct behaviour, its scale fitted for catering."""

@@ -11,7 +11,7 @@ from popl_rl.algorithms.problem import Problem
 from popl_rl.algorithms.stacked_adam import StackedAdam
 from popl_rl.models.schedules import decay
 
-__all__ = ["GIVEN", "NicheMembers"]
+__all__ = ["GIVEN", "NicheMembers", "train_niches"]
 
 GIVEN = 0.25
 """Share of the generations in which a division that was found is kept as it is."""
@@ -74,3 +74,26 @@ class NicheMembers:
         self.stack.members.data.update_(state["members"])
         self.served, self.share = state["served"].clone(), state["share"].clone()
         self.training.load_state_dict(state["training"])
+
+
+def train_niches(
+    problem: Problem,
+    served: Tensor,
+    *,
+    generations: int,
+    given: float = 1.0,
+    generator: torch.Generator,
+) -> NicheMembers:
+    """Fresh members, trained from beginning to end.
+
+    Args:
+        problem: What is to be learnt, and the recipe.
+        served: How much each niche serves each rater, ``[K, C]``, summing to 1 over K.
+        generations: Generations of training, ``problem.block`` steps each.
+        given: Share of them in which the division is kept as it was given.
+        generator: Source of initial weights and batches.
+    """
+    members = NicheMembers(problem, served, generator=generator)
+    for generation in range(generations):
+        members.step(generation, generations, given=given)
+    return members

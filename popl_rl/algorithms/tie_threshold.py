@@ -35,7 +35,7 @@ def with_threshold(
     population = problem.typical_population(1, generator=generator)
     pooled = MultiCPL(short, population=population, generator=generator)
     while pooled.generation < pooled.generations:
-        pooled.step()
+        pooled.step_unwatched()
         scores = pooled.problem.compared_scores(population)[0]
         said = problem.comparisons
         margin = scores[said.preferred] - pooled.problem.conservatism * scores[said.other]

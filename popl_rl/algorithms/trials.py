@@ -15,7 +15,7 @@ from torch import Tensor
 
 from popl_rl.algorithms.agreement import Agreement
 from popl_rl.algorithms.divisions import prediction
-from popl_rl.algorithms.niche_members import NicheMembers
+from popl_rl.algorithms.niche_members import train_niches
 from popl_rl.algorithms.problem import Problem
 from popl_rl.models.calibration import scale_for_strangers
 
@@ -87,9 +87,7 @@ def _trial(
     """Fresh members for one division of the raters ``served``, ``[K, C]``, in each fold."""
     margins = []
     for learnt, judged in folds:
-        members = NicheMembers(learnt, served, generator=generator)
-        for generation in range(generations):
-            members.step(generation, generations)
+        members = train_niches(learnt, served, generations=generations, generator=generator)
         margins.append(judged.margins(members.stack))
     answers = [judged.comparisons for _, judged in folds]
     values = [prediction(margin, own) for margin, own in zip(margins, answers, strict=True)]

@@ -13,14 +13,15 @@ from popl_rl.models.scoring import case_values
 def ring():
     """``ring(groups)``: bank, comparisons and the group of each rater."""
 
-    def make(groups, *, raters=12, answers=12, seed=0):
-        """Raters of groups evenly on a ring: bank, comparisons and the group of each rater."""
+    def make(groups, *, raters=12, answers=12, seed=0, apart=None):
+        """Raters of groups on a ring, evenly or so far apart: bank, comparisons, each's group."""
+        apart = 1 / groups if apart is None else apart
         generator = torch.Generator().manual_seed(seed)
         states = sample_states(400, generator=generator)
         group = torch.arange(raters * groups) % groups
         rater = torch.arange(len(group)).repeat_interleave(answers)
         pair = torch.randint(400, (len(rater), 2), generator=generator)
-        value = states["observation"][:, 0, 0][pair] + (group[rater] / groups).unsqueeze(1)
+        value = states["observation"][:, 0, 0][pair] + (apart * group[rater]).unsqueeze(1)
         first = (value.remainder(1)[:, 0] > value.remainder(1)[:, 1]).long()
         row = torch.arange(len(rater))
         comparisons = Comparisons(pair[row, 1 - first], pair[row, first], rater, len(group))
